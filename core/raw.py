@@ -1,0 +1,164 @@
+"""Photographs on disk -> linear channel planes, through LibRaw, and raw files out of mosaics.
+
+A channel plane is one colour of the Bayer mosaic at half resolution (sec. 4.1: no demosaicing), float32, black level
+subtracted, 1.0 at white level. An RGB file (EXR, TIFF) gives its planes at full resolution.
+"""
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .errors import CaptureError
+from .files import atomic
+
+LINEAR_SUFFIXES = {".exr", ".tif", ".tiff"}
+CAMERA_NAME = "Virtual macro camera"
+# Of the virtual camera: XYZ (D65) -> R, G, B, and its response to a neutral. They matter to raw developers only.
+_COLOR_MATRIX = (2.4967, -1.0463, -0.3736, -0.4291, 1.3896, 0.0811, -0.0643, 0.1044, 0.7407)
+_NEUTRAL = (0.8598, 1.0, 0.7944)
+
+
+@dataclass(frozen=True)
+class Mosaic:
+    """How to read a bare 16-bit ``.npy`` Bayer mosaic."""
+
+    pattern: str  # colours of the first two rows, such as "RGGB"
+    black: int  # number that means no light
+    white: int  # number at saturation
+
+
+def read_planes(path: Path, channels: str = "R", mosaic: Mosaic | None = None) -> np.ndarray:
+    """The channel planes (len(channels), H, W), float32, linear, 0 at black and 1 at white. channels: of "R", "G", "B".
+
+    The two greens of a Bayer cell are averaged. Raises CaptureError for a file that is missing, damaged, or of a kind
+    that has no planes of its own (no Bayer pattern).
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CaptureError(f"{path}: the photograph is missing")
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        if mosaic is None:
+            raise CaptureError(f'{path}: a .npy photograph needs "mosaic" (pattern, black, white) in capture.json')
+        return _bayer_planes(_load_npy(path), mosaic.pattern, (mosaic.black,) * 4, mosaic.white, channels, path)
+    if suffix in LINEAR_SUFFIXES:
+        return _linear_planes(path, channels)
+    return _raw_planes(path, channels)
+
+
+def _bayer_planes(mosaic, pattern, blacks, white, channels, path) -> np.ndarray:
+    """Planes (len(channels), H, W) of a mosaic (2H, 2W); blacks: of the four sites of a cell, row by row."""
+    height, width = mosaic.shape[0] // 2, mosaic.shape[1] // 2
+    if len(pattern) != 4 or not set(channels) <= set(pattern):
+        raise CaptureError(f"{path}: the Bayer pattern is {pattern!r}; expected four letters of R, G and B, as in 'RGGB'")
+    planes = np.zeros((len(channels), height, width), np.float32)
+    for plane, channel in zip(planes, channels, strict=True):
+        sites = [i for i, letter in enumerate(pattern) if letter == channel]
+        for site in sites:
+            cell = mosaic[site // 2 : 2 * height : 2, site % 2 : 2 * width : 2]
+            plane += (cell.astype(np.float32) - np.float32(blacks[site])) / np.float32(len(sites) * (white - blacks[site]))
+    return planes
+
+
+def _load_npy(path: Path) -> np.ndarray:
+    try:
+        mosaic = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise CaptureError(f"{path}: not a complete .npy file ({_one_line(error)})") from error
+    if mosaic.ndim != 2 or mosaic.dtype != np.uint16:
+        raise CaptureError(f"{path}: expected a mosaic (rows, columns) of uint16, found {mosaic.shape} of {mosaic.dtype}")
+    return mosaic
+
+
+def _linear_planes(path: Path, channels: str) -> np.ndarray:
+    try:
+        if path.suffix.lower() == ".exr":
+            import OpenEXR
+
+            with OpenEXR.File(str(path), separate_channels=True) as exr:
+                found = {name: np.array(c.pixels, np.float32) for name, c in exr.channels().items()}
+        else:
+            import tifffile
+
+            image = tifffile.imread(path)
+            if image.ndim != 3 or image.shape[2] < 3:
+                raise CaptureError(f"{path}: expected a linear image (rows, columns, R G B), found shape {image.shape}")
+            scale = np.iinfo(image.dtype).max if np.issubdtype(image.dtype, np.integer) else 1
+            found = {name: image[..., i].astype(np.float32) / scale for i, name in enumerate("RGB")}
+    except CaptureError:
+        raise
+    except Exception as error:  # both libraries raise their own and the standard kinds for damaged files
+        raise CaptureError(f"{path}: cannot be read as an image ({_one_line(error)})") from error
+    missing = [c for c in channels if c not in found]
+    if missing:
+        raise CaptureError(f"{path}: expected channels R, G, B; found {', '.join(sorted(found))}")
+    return np.stack([found[c] for c in channels])
+
+
+def _raw_planes(path: Path, channels: str) -> np.ndarray:
+    import rawpy
+
+    try:
+        with _quiet_stderr(), rawpy.imread(str(path)) as raw:
+            if raw.raw_pattern is None or raw.raw_pattern.shape != (2, 2):
+                raise CaptureError(f"{path}: has no 2x2 Bayer pattern (a linear or demosaiced raw); expected a camera's own raw file")
+            names = raw.color_desc.decode("ascii", "replace")
+            sites = raw.raw_pattern.ravel()
+            blacks = [raw.black_level_per_channel[i] for i in sites]
+            return _bayer_planes(raw.raw_image_visible, "".join(names[i] for i in sites), blacks, raw.white_level, channels, path)
+    except (rawpy.LibRawError, OSError, ValueError) as error:
+        raise CaptureError(f"{path}: LibRaw cannot read this photograph, it may be cut short or damaged ({_one_line(error)})") from error
+
+
+def write_dng(path: Path, mosaic: np.ndarray, black: int, white: int) -> None:
+    """Write a mosaic (2H, 2W) uint16, RGGB, as an uncompressed DNG that LibRaw reads back unchanged; atomically."""
+    import tifffile
+
+    tags = [
+        (33421, "H", 2, (2, 2), True),  # CFARepeatPatternDim
+        (33422, "B", 4, bytes([0, 1, 1, 2]), True),  # CFAPattern
+        (50706, "B", 4, bytes([1, 4, 0, 0]), True),  # DNGVersion
+        (50707, "B", 4, bytes([1, 1, 0, 0]), True),  # DNGBackwardVersion
+        (50708, "s", 0, CAMERA_NAME, True),  # UniqueCameraModel
+        (50710, "B", 3, bytes([0, 1, 2]), True),  # CFAPlaneColor
+        (50711, "H", 1, 1, True),  # CFALayout: rectangular
+        (50713, "H", 2, (1, 1), True),  # BlackLevelRepeatDim
+        (50714, "H", 1, black, True),  # BlackLevel
+        (50717, "H", 1, white, True),  # WhiteLevel
+        (50721, "2i", 9, _rationals(_COLOR_MATRIX), True),  # ColorMatrix1
+        (50728, "2I", 3, _rationals(_NEUTRAL), True),  # AsShotNeutral
+        (50778, "H", 1, 21, True),  # CalibrationIlluminant1: D65
+        (271, "s", 0, "Strandscope", True),  # Make
+        (272, "s", 0, CAMERA_NAME, True),  # Model
+        (274, "H", 1, 1, True),  # Orientation
+    ]
+    with atomic(path) as part:
+        tifffile.imwrite(part, mosaic, photometric="CFA", planarconfig=1, subfiletype=0, metadata=None, extratags=tags)
+
+
+def _rationals(values) -> tuple[int, ...]:
+    return tuple(int(v) for x in values for v in (round(x * 10000), 10000))
+
+
+def _one_line(error: Exception) -> str:
+    text = error.args[0] if error.args and isinstance(error.args[0], bytes) else str(error)
+    return " ".join((text.decode(errors="replace") if isinstance(text, bytes) else text).split()) or type(error).__name__
+
+
+@contextmanager
+def _quiet_stderr() -> Iterator[None]:
+    """LibRaw prints its complaints by itself; ours says the same with the file's name."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)

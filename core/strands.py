@@ -1,0 +1,150 @@
+"""The result: hair as many 3D curves, one flat array of points and the offsets at which the curves begin."""
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from .errors import StrandsError
+from .files import atomic
+
+CAPTURED, INFILL = 0, 1  # the values of ``kind``
+
+
+@dataclass(frozen=True)
+class Strands:
+    """M curves of N points. Curve i is ``points_mm[offsets[i]:offsets[i + 1]]``."""
+
+    points_mm: np.ndarray  # (N, 3) float32, object frame
+    offsets: np.ndarray  # (M + 1,) int64
+    radius_mm: np.ndarray  # (N,) float32
+    kind: np.ndarray  # (M,) uint8: CAPTURED or INFILL
+    confidence: np.ndarray  # (N,) float32, 0 to 1
+    provenance: dict = field(default_factory=dict)  # capture's name, parameters, version
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def __getitem__(self, i: int) -> np.ndarray:
+        """Points (n, 3) of curve i, mm."""
+        return self.points_mm[self.offsets[i] : self.offsets[i + 1]]
+
+    def select(self, keep: np.ndarray) -> "Strands":
+        """The curves for which keep (M,) is true."""
+        sizes = np.diff(self.offsets)
+        points = np.repeat(keep, sizes)
+        return replace(
+            self,
+            points_mm=self.points_mm[points],
+            offsets=offsets_of(sizes[keep]),
+            radius_mm=self.radius_mm[points],
+            kind=self.kind[keep],
+            confidence=self.confidence[points],
+        )
+
+    @property
+    def captured(self) -> "Strands":
+        """The curves that were seen, without the infill."""
+        return self.select(self.kind == CAPTURED)
+
+
+def offsets_of(sizes: np.ndarray) -> np.ndarray:
+    """Offsets (M + 1,) int64 of curves with sizes (M,) points."""
+    return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+
+
+def lengths(points_mm: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """Length (M,) of each curve, mm."""
+    steps = np.r_[0.0, np.linalg.norm(np.diff(np.asarray(points_mm, float), axis=0), axis=1)]
+    steps[np.asarray(offsets[:-1])[np.diff(offsets) > 0]] = 0.0
+    total = np.r_[0.0, np.cumsum(steps)]
+    return total[offsets[1:]] - total[offsets[:-1]]
+
+
+def concatenate(parts: list[Strands], provenance: dict) -> Strands:
+    """All curves of the parts, in order."""
+    return Strands(
+        points_mm=np.concatenate([p.points_mm for p in parts]),
+        offsets=offsets_of(np.concatenate([np.diff(p.offsets) for p in parts])),
+        radius_mm=np.concatenate([p.radius_mm for p in parts]),
+        kind=np.concatenate([p.kind for p in parts]),
+        confidence=np.concatenate([p.confidence for p in parts]),
+        provenance=provenance,
+    )
+
+
+def save_strands(path: Path, strands: Strands) -> None:
+    """Write a strands file (.npz), atomically; the same strands give the same bytes. Raises StrandsError for bad values."""
+    check(strands, path)
+    arrays = {
+        "points": strands.points_mm.astype(np.float32),
+        "offsets": strands.offsets.astype(np.int64),
+        "radius": strands.radius_mm.astype(np.float32),
+        "kind": strands.kind.astype(np.uint8),
+        "confidence": strands.confidence.astype(np.float32),
+        "provenance": np.array(json.dumps(strands.provenance, sort_keys=True)),
+    }
+    with atomic(path) as part:
+        np.savez(part, **arrays)  # numpy writes the zip's time stamps as 1980-01-01
+
+
+def load_strands(path: Path) -> Strands:
+    """Read a strands file. Raises StrandsError, naming the array, for anything but a whole and finite one."""
+    arrays = load_arrays(path, ("points", "offsets"))
+    points, offsets = arrays["points"], arrays["offsets"]
+    count = len(points) if points.ndim else 0
+    sizes = max(len(offsets) - 1, 0) if offsets.ndim else 0
+    try:
+        provenance = json.loads(str(arrays.get("provenance", "{}")))
+    except json.JSONDecodeError as error:
+        raise StrandsError(f"{path}: provenance is not valid JSON: {error}") from error
+    strands = Strands(
+        points_mm=points,
+        offsets=offsets,
+        radius_mm=arrays.get("radius", np.full(count, 0.04, np.float32)),
+        kind=arrays.get("kind", np.zeros(sizes, np.uint8)),
+        confidence=arrays.get("confidence", np.ones(count, np.float32)),
+        provenance=provenance,
+    )
+    check(strands, path)
+    return strands
+
+
+def load_arrays(path: Path, required: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """The arrays of an .npz file. Raises StrandsError where it is missing, damaged, or lacks a required array."""
+    path = Path(path)
+    if not path.is_file():
+        raise StrandsError(f"{path}: not found; expected an .npz file")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = dict(archive)
+    except Exception as error:  # zipfile, zlib and numpy each raise their own for damaged files
+        raise StrandsError(f"{path}: not a complete .npz file ({' '.join(str(error).split())})") from error
+    missing = [name for name in required if name not in arrays]
+    if missing:
+        raise StrandsError(f"{path}: the array '{missing[0]}' is missing; found {', '.join(sorted(arrays)) or 'nothing'}")
+    return arrays
+
+
+def check(strands: Strands, path: Path) -> None:
+    """Raise StrandsError, naming ``path`` and the array, unless shapes agree and every value is one that hair can have."""
+    points, offsets = strands.points_mm, strands.offsets
+    _expect(points.ndim == 2 and points.shape[1] == 3, path, "points", points.shape, "shape (N, 3)")
+    _expect(offsets.ndim == 1 and len(offsets) > 0 and np.issubdtype(offsets.dtype, np.integer), path, "offsets", offsets.dtype, "integers (M + 1,)")
+    good = offsets[0] == 0 and offsets[-1] == len(points) and bool(np.all(np.diff(offsets) >= 2))
+    _expect(good, path, "offsets", "out of order", f"0 … {len(points)}, each curve with at least 2 points")
+    for name, values in (("radius", strands.radius_mm), ("confidence", strands.confidence)):
+        _expect(values.shape == (len(points),), path, name, values.shape, f"one value a point ({len(points)},)")
+    _expect(strands.kind.shape == (len(strands),), path, "kind", strands.kind.shape, f"one value a curve ({len(strands)},)")
+    for name, values in (("points", points), ("radius", strands.radius_mm), ("confidence", strands.confidence)):
+        bad = np.argwhere(~np.isfinite(values))
+        if len(bad):
+            raise StrandsError(f"{path}: {name}{bad[0].tolist()} is {values[tuple(bad[0])]}; expected finite numbers ({len(bad)} are not)")
+    _expect(bool(np.all(strands.radius_mm > 0)), path, "radius", "0 or less", "more than 0 mm")
+    _expect(bool(np.all(strands.kind <= INFILL)), path, "kind", int(strands.kind.max(initial=0)), "0 (captured) or 1 (infill)")
+
+
+def _expect(good: bool, path: Path, name: str, found, expected: str) -> None:
+    if not good:
+        raise StrandsError(f"{path}: {name} is {found}; expected {expected}")
