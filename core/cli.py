@@ -1,0 +1,276 @@
+"""``strandscope …``: each verb gathers its arguments, calls one function of the core, and says what came of it.
+
+Heavy modules are imported inside the verbs, so that ``--help`` is instant. ``run`` is the one way in: it turns whatever
+goes wrong into one line and an exit code.
+"""
+
+import json
+import os
+import re
+import sys
+import traceback
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import click
+
+from . import terminal
+from .errors import StrandscopeError
+from .files import atomic, explain
+
+PATH = click.Path(path_type=Path)
+PRESETS = ("auto", "straight", "wavy", "curls")
+FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
+
+
+@dataclass
+class Session:
+    """What one run of the program was asked for beside its verb."""
+
+    mode: str = "auto"
+    debug: bool = False
+
+    @cached_property
+    def report(self) -> terminal.Reporter:
+        """The progress callback to hand to the core; also ``show`` for results, and ``done`` for the finished file."""
+        return terminal.reporter(self.mode)
+
+
+def common(command):
+    """Add the options that every verb understands. They may stand before the verb too."""
+    for option in (
+        click.option("--progress", type=click.Choice(terminal.MODES), expose_value=False, callback=_set_mode, is_eager=True,
+                     help="How progress is shown: bars in a terminal (auto, rich), one JSON event a line on stdout, or none."),
+        click.option("--stop-with-parent", is_flag=True, expose_value=False, callback=_set_stop, is_eager=True,
+                     help="Stop when standard input closes; for programs that start this one."),
+        click.option("--debug", is_flag=True, expose_value=False, callback=_set_debug, is_eager=True,
+                     help="Show where in the program an error arose."),
+    ):  # fmt: skip
+        command = option(command)
+    return command
+
+
+def _set_mode(context, _parameter, mode):
+    if mode:
+        context.ensure_object(Session).mode = mode
+
+
+def _set_debug(context, _parameter, debug):
+    if debug:
+        context.ensure_object(Session).debug = True
+
+
+def _set_stop(_context, _parameter, stop):
+    if stop:
+        terminal.stop_with_parent()
+
+
+def run(argv: list[str], group: click.Group | None = None) -> int:
+    """Run one command line; returns its exit code: 0, 1 for what went wrong, 2 for wrong use, 130 when interrupted.
+
+    Whatever goes wrong is one line on stderr, ``strandscope: …``. A traceback is shown with --debug only.
+    """
+    session = Session()
+    try:
+        with terminal.interruptible():
+            code = (group or main_group).main(args=argv, prog_name="strandscope", standalone_mode=False, obj=session)
+        return code if isinstance(code, int) else 0
+    except click.exceptions.NoArgsIsHelpError as error:
+        print(error.format_message(), file=sys.stderr)
+        return WRONG_USE
+    except BrokenPipeError:  # the reader of our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except (Exception, KeyboardInterrupt) as error:
+        if session.debug:
+            traceback.print_exc()
+        code, message = _explain(error)
+        session.report.failed(" ".join(message.splitlines()))
+        return code
+    finally:
+        session.report.close()
+
+
+def _explain(error: BaseException) -> tuple[int, str]:
+    """Exit code and the line that the user sees."""
+    if isinstance(error, click.UsageError):
+        path = error.ctx.command_path if error.ctx else "strandscope"
+        return WRONG_USE, f"{error.format_message()} (see {path} --help)"
+    if isinstance(error, KeyboardInterrupt | click.Abort):
+        return INTERRUPTED, "stopped"
+    if isinstance(error, StrandscopeError):
+        return FAILED, str(error)
+    if isinstance(error, OSError):
+        return FAILED, str(explain(error, Path(error.filename))) if error.filename else str(error.strerror or error)
+    if isinstance(error, MemoryError):
+        return FAILED, "there is not enough memory for this; try fewer --workers or a smaller --memory"
+    return FAILED, f"an error in the program itself, {type(error).__name__}: {error} (--debug shows where)"
+
+
+def version() -> str:
+    """The version of the package that this module is part of, under whatever name it was imported."""
+    return sys.modules[__package__.rpartition(".")[0]].__version__
+
+
+class Memory(click.ParamType):
+    """An amount of memory such as 6GB or 800MB, in bytes (1 GB is 10^9 bytes)."""
+
+    name = "amount"
+
+    def convert(self, value, param, ctx):
+        if isinstance(value, int):
+            return value
+        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kMGT]?)i?B?", value.strip(), re.IGNORECASE)
+        if not match or float(match[1]) == 0:
+            self.fail(f"{value!r} is no amount of memory; expected a number and a unit, as in 6GB", param, ctx)
+        return int(float(match[1]) * 1000 ** " KMGT".index(match[2].upper() or " "))
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(version=version(), message="%(version)s")
+@common
+def main_group():
+    """Capture a real lock of hair fiber by fiber, and bring it into Blender.
+
+    Photographs of the hair go in (a capture), curves come out (a strands file). Try it without a camera:
+
+    \b
+      strandscope simulate lock --scale tiny
+      strandscope reconstruct lock -o out/strands.npz
+      strandscope score out/strands.npz lock/truth.npz
+    """
+
+
+@main_group.command(short_help="Photograph known hair: make a capture to try things on.")
+@click.argument("out", type=PATH)
+@click.option("--style", type=click.Choice(["straight", "wavy", "curls"]), default="straight", show_default=True, help="How the hair falls.")
+@click.option(
+    "--scale",
+    type=click.Choice(["tiny", "small", "medium", "paper"]),
+    default="small",
+    show_default=True,
+    help="Size of the photographs and number of sweeps: tiny takes seconds, paper takes hours.",
+)
+@click.option("--fibers", type=click.IntRange(1), help="Number of hairs, in place of the scale's own.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Another number gives another lock of the same kind.")
+@common
+@click.pass_obj
+def simulate(session, out, style, scale, fibers, seed):
+    """Photograph hair that is known: make a capture in the folder OUT from simulated fibers.
+
+    Leaves raw photographs (DNG), capture.json, and truth.npz, which says where every hair really is, so that a
+    reconstruction can be scored.
+
+    \b
+    Example:
+      strandscope simulate lock --style wavy --scale tiny
+    """
+    from . import simulate as simulator
+
+    choices = {"style": style, "seed": seed} | ({"fibers": fibers} if fibers else {})
+    simulator.simulate(out, replace(simulator.SCALES[scale], **choices), session.report)
+    session.report.done(out)
+
+
+@main_group.command(short_help="Find the hairs in a capture, write them as curves.")
+@click.argument("capture", type=PATH)
+@click.option("-o", "--output", type=PATH, required=True, help="The strands file to write (.npz).")
+@click.option(
+    "--preset",
+    type=click.Choice(PRESETS),
+    default="auto",
+    show_default=True,
+    help="The paper's settings for a kind of hair; auto estimates them from the photographs.",
+)
+@click.option("--params", type=PATH, help="A TOML file with settings, in place of a preset.")
+@click.option("--method", type=click.Choice(["paper"]), default="paper", show_default=True, help="The way of reconstruction.")
+@click.option("--infill", type=click.IntRange(0), metavar="N", help="Number of hairs to add inside, where no camera sees.")
+@click.option("--no-infill", is_flag=True, help="Captured hairs only.")
+@click.option("--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given.")
+@click.option("--memory", type=Memory(), default="6GB", show_default=True, help="Memory to use at most.")
+@common
+@click.pass_obj
+def reconstruct(session, capture, output, preset, params, method, infill, no_infill, workers, memory):
+    """Find the hairs in the photographs of CAPTURE and write them as curves to a strands file.
+
+    CAPTURE is a folder with capture.json in it (`strandscope import` makes one from photographs). What a run needs to
+    continue after a crash is kept in a folder beside the output: run the same command again.
+
+    \b
+    Example:
+      strandscope reconstruct lock -o out/strands.npz --preset straight --no-infill
+    """
+    from . import pipeline
+
+    if infill is not None and no_infill:
+        raise click.UsageError("--infill and --no-infill exclude each other")
+    parameters = pipeline.read_toml(params) if params else pipeline.preset(preset)
+    changes = {"method": method, "memory_bytes": memory}
+    if no_infill or infill is not None:
+        changes["infill"] = infill or 0
+    pipeline.reconstruct(capture, output, replace(parameters, **changes), workers=workers, progress=session.report)
+    session.report.done(output)
+
+
+@main_group.command(short_help="Count and measure the hairs of a strands file.")
+@click.argument("strands", type=PATH)
+@click.option("--json", "json_file", type=PATH, help="Write the numbers to this file too.")
+@common
+@click.pass_obj
+def stats(session, strands, json_file):
+    """Count and measure the hairs of a strands file, as the paper's results do.
+
+    Prints the number of curves, how many of them cross a horizontal plane on average, their lengths, and how many were
+    captured and how many added inside.
+
+    \b
+    Example:
+      strandscope stats out/strands.npz --json out/stats.json
+    """
+    from .strands import load_strands, statistics
+
+    _show_numbers(session, statistics(load_strands(strands)), json_file)
+
+
+@main_group.command(short_help="Compare found hairs with the hairs that are there.")
+@click.argument("strands", type=PATH)
+@click.argument("truth", type=PATH)
+@click.option("--tolerance-mm", type=click.FloatRange(min=0, min_open=True), default=0.1, show_default=True, help="How near counts as found.")
+@click.option("--json", "json_file", type=PATH, help="Write the numbers to this file too.")
+@common
+@click.pass_obj
+def score(session, strands, truth, tolerance_mm, json_file):
+    """Compare reconstructed hairs with the hairs that are known to be there.
+
+    STRANDS is a strands file, TRUTH the truth.npz of a simulated capture. Recall: how much of the visible hair was found.
+    Precision: how much of what was found is hair. Hairs that were added inside (infill) are left out.
+
+    \b
+    Example:
+      strandscope score out/strands.npz lock/truth.npz
+    """
+    from .compare import load_truth, score
+    from .strands import load_strands
+
+    found = load_strands(strands).captured
+    _show_numbers(session, score(found.points_mm, found.offsets, load_truth(truth), tolerance_mm), json_file)
+
+
+def _show_numbers(session: Session, numbers: dict, json_file: Path | None) -> None:
+    if json_file:
+        with atomic(json_file) as part:
+            part.write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+        session.report.done(json_file)
+    session.report.show(terminal.table(_rows(numbers)))
+
+
+def _rows(numbers: dict, prefix: str = "") -> list[tuple[str, str]]:
+    """Nested numbers as (name, text) rows."""
+    rows = []
+    for name, value in numbers.items():
+        if isinstance(value, dict):
+            rows += _rows(value, f"{prefix}{name} ")
+        else:
+            rows.append((prefix + name, f"{value:.4g}" if isinstance(value, float) else str(value)))
+    return rows
