@@ -228,9 +228,10 @@ def stats(session, strands, json_file):
     Example:
       strandscope stats out/strands.npz --json out/stats.json
     """
-    from .strands import load_strands, statistics
+    from .strands import describe, load_strands, statistics
 
-    _show_numbers(session, statistics(load_strands(strands)), json_file)
+    numbers = statistics(load_strands(strands))
+    _hand_over(session, numbers, terminal.table(describe(numbers)), json_file)
 
 
 @main_group.command(short_help="Compare found hairs with the hairs that are there.")
@@ -250,27 +251,17 @@ def score(session, strands, truth, tolerance_mm, json_file):
     Example:
       strandscope score out/strands.npz lock/truth.npz
     """
-    from .compare import load_truth, score
+    from .compare import load_truth, score, summary
     from .strands import load_strands
 
-    found = load_strands(strands).captured
-    _show_numbers(session, score(found.points_mm, found.offsets, load_truth(truth), tolerance_mm), json_file)
+    report = score(load_strands(strands), load_truth(truth), tolerance_mm)
+    _hand_over(session, report, terminal.table(summary(report)), json_file)
 
 
-def _show_numbers(session: Session, numbers: dict, json_file: Path | None) -> None:
+def _hand_over(session: Session, numbers: dict, text: str, json_file: Path | None) -> None:
+    """Numbers to a JSON file if one is wanted, their text to the reader."""
     if json_file:
         with atomic(json_file) as part:
             part.write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
         session.report.done(json_file)
-    session.report.show(terminal.table(_rows(numbers)))
-
-
-def _rows(numbers: dict, prefix: str = "") -> list[tuple[str, str]]:
-    """Nested numbers as (name, text) rows."""
-    rows = []
-    for name, value in numbers.items():
-        if isinstance(value, dict):
-            rows += _rows(value, f"{prefix}{name} ")
-        else:
-            rows.append((prefix + name, f"{value:.4g}" if isinstance(value, float) else str(value)))
-    return rows
+    session.report.show(text)

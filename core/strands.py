@@ -62,6 +62,53 @@ def lengths(points_mm: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     return total[offsets[1:]] - total[offsets[:-1]]
 
 
+def statistics(strands: Strands) -> dict:
+    """The numbers that the paper's section 5 gives of a result: counts, lengths in mm, and the mean number of captured
+    curves that cross a horizontal plane, over all planes between their lowest and highest point.
+
+    Lengths and crossings are those of the captured curves; of the infill, count and total length.
+    """
+    captured = strands.captured
+    length = lengths(captured.points_mm, captured.offsets)
+    height = captured.points_mm[:, 1].astype(float)
+    extent = float(np.ptp(height)) if len(captured) else 0.0
+    starts = captured.offsets[:-1]
+    spans = np.maximum.reduceat(height, starts) - np.minimum.reduceat(height, starts) if len(captured) else np.zeros(0)
+    infill = strands.select(strands.kind == INFILL)
+    return {
+        "curves": len(captured),
+        "mean_curves_crossing_a_horizontal_plane": float(spans.sum() / extent) if extent else 0.0,
+        "height_mm": extent,
+        "length_mm": {
+            "total": float(length.sum()),
+            "mean": float(length.mean()) if len(length) else 0.0,
+            "median": float(np.median(length)) if len(length) else 0.0,
+            "longest": float(length.max(initial=0.0)),
+        },
+        "infill_curves": len(infill),
+        "infill_length_mm": float(lengths(infill.points_mm, infill.offsets).sum()),
+        "points": len(strands.points_mm),
+        "mean_radius_mm": float(captured.radius_mm.mean()) if len(captured) else 0.0,
+        "mean_confidence": float(captured.confidence.mean()) if len(captured) else 0.0,
+    }
+
+
+def describe(numbers: dict) -> list[tuple[str, str]]:
+    """The numbers of ``statistics`` as rows (name, value) for people."""
+    length = numbers["length_mm"]
+    crossing = f"{numbers['mean_curves_crossing_a_horizontal_plane']:.1f} on average, over a height of {numbers['height_mm']:.1f} mm"
+    return [
+        ("captured curves", f"{numbers['curves']}"),
+        ("crossing a horizontal plane", crossing),
+        ("length of a curve", f"{length['mean']:.1f} mm (median {length['median']:.1f}, longest {length['longest']:.1f})"),
+        ("length of all", f"{length['total']:.0f} mm"),
+        ("radius", f"{numbers['mean_radius_mm']:.4f} mm"),
+        ("confidence", f"{numbers['mean_confidence']:.2f} of 1"),
+        ("infill curves", f"{numbers['infill_curves']} ({numbers['infill_length_mm']:.0f} mm)"),
+        ("points", f"{numbers['points']}"),
+    ]
+
+
 def concatenate(parts: list[Strands], provenance: dict) -> Strands:
     """All curves of the parts, in order."""
     return Strands(
