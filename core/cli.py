@@ -213,6 +213,46 @@ def reconstruct(session, capture, output, preset, params, method, infill, no_inf
     session.report.done(output)
 
 
+@main_group.command(short_help="Draw the curves back onto a photograph.")
+@click.argument("capture", type=PATH)
+@click.argument("strands", type=PATH)
+@click.option("-o", "--output", type=PATH, required=True, help="The picture to write (.png).")
+@click.option("--sweep", type=click.IntRange(0), metavar="K", help="Take a photograph of this sweep; the first is 0.")
+@click.option("--angle", type=float, metavar="DEG", help="Take a photograph of the sweep nearest to this angle.")
+@click.option("--position", type=float, metavar="MM", help="Take the photograph with its plane of focus nearest to this position.")
+@click.option(
+    "--color",
+    type=click.Choice(["strand", "kind"]),
+    default="strand",
+    show_default=True,
+    help="Each curve in a colour of its own, or captured hairs and infill told apart.",
+)
+@click.option("--operator", type=click.Choice(["paper", "oriented"]), default="oriented", show_default=True, help="The ridge filter to show.")
+@common
+@click.pass_obj
+def overlay(session, capture, strands, output, sweep, angle, position, color, operator):
+    """Draw the curves of a strands file back onto a photograph of CAPTURE, to see whether they lie on the hairs.
+
+    The picture shows the photograph, the ridges that were found in it, and the curves over the photograph. Only the parts of
+    curves that are in focus there are drawn. Without further options it is the photograph with most of them.
+
+    \b
+    Example:
+      strandscope overlay lock out/strands.npz -o out/overlay.png --angle 90
+    """
+    from . import compare
+    from .capture import load_capture
+    from .ridges import RidgeParams
+    from .strands import load_strands
+
+    if sweep is not None and angle is not None:
+        raise click.UsageError("--sweep and --angle exclude each other")
+    photographs, curves = load_capture(capture), load_strands(strands)
+    shot = compare.choose_shot(photographs, curves, sweep, angle, position)
+    session.report.show(compare.overlay(photographs, curves, shot, output, RidgeParams(operator=operator), color))
+    session.report.done(output)
+
+
 @main_group.command(short_help="Count and measure the hairs of a strands file.")
 @click.argument("strands", type=PATH)
 @click.option("--json", "json_file", type=PATH, help="Write the numbers to this file too.")

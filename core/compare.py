@@ -1,5 +1,6 @@
 """How good a result is: its curves against known hair, and drawn back onto the photographs they came from (Figure 14)."""
 
+import colorsys
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -8,8 +9,12 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-from .errors import StrandsError
-from .strands import Strands, load_arrays, offsets_of
+from .capture import Capture
+from .errors import StrandscopeError, StrandsError
+from .files import atomic
+from .geometry import Optics, camera_points, project, to_pixel
+from .ridges import RidgeParams, response
+from .strands import INFILL, Strands, load_arrays, offsets_of
 
 SAMPLE_MM = 0.1  # spacing at which reconstructed length is judged
 TRUTH_MM = 0.02  # spacing at which true centrelines are searched
@@ -19,6 +24,12 @@ ANGLE_BINS = (0, 1, 4, 8, 12, 16)
 SIGMA_MM, SWITCH_COST = 0.04, 12.0  # of the assignment of a curve to fibers: spread of distances, price of a change
 REACH = 1.25  # fibers farther than this times the tolerance are not considered
 ON_FIBER_MM, FOLLOWED_MM = 0.3, 0.5  # shortest run that counts as being on a fiber, and as following it
+
+SHARP_MM = 0.1  # blur, a hair's width, up to which a point counts as in focus
+PANEL_PX = 840  # a photograph is enlarged by a whole factor until it is at least as wide or tall as this
+SMOOTH = 3  # samples a pixel and axis when lines are drawn
+CAPTION_PX = 26
+INFILL_COLOR = (150, 150, 150)
 
 
 @dataclass(frozen=True)
@@ -287,3 +298,128 @@ def _viterbi(offsets, starts, fiber, cost, no_fiber, switch):
                 path[first + i] = names[s]
             s = back[i, s]
     return path
+
+
+# ---- curves drawn back onto a photograph (Figure 14) ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A photograph of a capture, by number."""
+
+    sweep: int
+    photograph: int
+
+
+def depth_of_field_mm(optics: Optics) -> float:
+    """Extent along w, around the plane of focus, in which the cone of rays is narrower than a hair (the paper's 1.2 mm)."""
+    return SHARP_MM / np.tan(np.radians(optics.aperture_cone_deg / 2))
+
+
+def choose_shot(
+    capture: Capture, strands: Strands, sweep: int | None = None, angle_deg: float | None = None, position_mm: float | None = None
+) -> Shot:
+    """The photograph with the most curve in focus, among those of a sweep (by number from 0, or nearest angle) and nearest
+    to a position where these are given. Raises StrandscopeError for a sweep that is not there."""
+    if sweep is not None and not 0 <= sweep < len(capture.sweeps):
+        raise StrandscopeError(f"{capture.folder}: there is no sweep {sweep}; expected 0 … {len(capture.sweeps) - 1}")
+    if sweep is None and angle_deg is not None:
+        away = [abs((s.angle_deg - angle_deg + 180) % 360 - 180) for s in capture.sweeps]
+        sweep = int(np.argmin(away))
+    best, most = Shot(0 if sweep is None else sweep, 0), -1
+    half = depth_of_field_mm(capture.optics) / 2
+    for k in range(len(capture.sweeps)) if sweep is None else [sweep]:
+        positions = np.asarray(capture.sweeps[k].positions_mm)
+        depth = np.sort(camera_points(strands.points_mm, capture.sweeps[k].angle_deg)[:, 2])
+        in_focus = np.searchsorted(depth, positions + half) - np.searchsorted(depth, positions - half)
+        i = int(np.argmax(in_focus) if position_mm is None else np.argmin(np.abs(positions - position_mm)))
+        if in_focus[i] > most:
+            best, most = Shot(k, i), in_focus[i]
+    return best
+
+
+def in_focus(capture: Capture, strands: Strands, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (S, 2, 2) of the ends (column, row) of all segments within the depth of field, and their curves (S,)."""
+    sweep = capture.sweeps[shot.sweep]
+    d, optics = sweep.positions_mm[shot.photograph], capture.optics
+    u, v, w = camera_points(strands.points_mm, sweep.angle_deg).T
+    u, v = project(u, v, w, d, optics.working_distance_mm)
+    pixel = np.stack(to_pixel(u, v, optics.pitch_mm, optics.axis_col_px, optics.axis_row_px), axis=1)
+    curve = np.repeat(np.arange(len(strands)), np.diff(strands.offsets))
+    sharp = np.abs(w - d) <= depth_of_field_mm(optics) / 2
+    keep = sharp[:-1] & sharp[1:] & (curve[:-1] == curve[1:])
+    return np.stack([pixel[:-1][keep], pixel[1:][keep]], axis=1), curve[:-1][keep]
+
+
+def overlay(capture: Capture, strands: Strands, shot: Shot, out: Path, ridges: RidgeParams, color_by: str = "strand") -> str:
+    """Write a picture (.png): a photograph, its ridges, and the curves in focus drawn over it, side by side.
+
+    color_by: "strand" gives each curve a colour of its own; "kind" tells captured from infill. Returns the caption.
+    Raises CaptureError for a photograph that cannot be read, StrandscopeError for a picture that cannot be written.
+    """
+    from PIL import Image
+
+    if Path(out).suffix.lower() != ".png":
+        raise StrandscopeError(f"{out}: the picture's name must end in .png")
+    sweep = capture.sweeps[shot.sweep]
+    file = sweep.files[shot.photograph]
+    planes = capture.planes(file, "RGB")
+    zoom = max(1, -(-PANEL_PX // max(planes.shape[1:])))
+    segments, curve = in_focus(capture, strands, shot)
+    caption = f"{file}: sweep {shot.sweep} at {sweep.angle_deg:g}°, d = {sweep.positions_mm[shot.photograph]:g} mm"
+    count = f"{len(np.unique(curve))} of {len(strands)} curves in focus (within {depth_of_field_mm(capture.optics):.1f} mm)"
+    photograph = _enlarge(_developed(planes), zoom)
+    crests = response(planes[0], ridges)
+    shown = (255 * np.sqrt(np.clip(crests / max(float(np.percentile(crests[crests > 0], 99)) if (crests > 0).any() else 1.0, 1e-6), 0, 1))).astype(
+        np.uint8
+    )
+    gray = photograph.convert("L").point(lambda x: x // 2).convert("RGB")
+    drawn = _draw(gray, segments, _colors(strands, color_by)[curve], zoom)
+    panels = [(photograph, caption), (_enlarge(shown, zoom).convert("RGB"), "ridges"), (drawn, count)]
+    width, height = photograph.size
+    picture = Image.new("RGB", (3 * width + 2 * 4, height + CAPTION_PX), (24, 24, 24))
+    for k, (panel, text) in enumerate(panels):
+        picture.paste(panel, (k * (width + 4), 0))
+        _write(picture, (k * (width + 4) + 6, height + 4), text)
+    with atomic(out) as part:
+        picture.save(part)
+    return f"{caption}; {count}"
+
+
+def _developed(planes: np.ndarray) -> np.ndarray:
+    """Linear planes (3, H, W) -> (H, W, 3) uint8 for the eye: the brightest half percent is white, gamma 2.2."""
+    light = np.clip(planes / max(float(np.percentile(planes, 99.5)), 1e-6), 0, 1) ** (1 / 2.2)
+    return (255 * np.moveaxis(light, 0, -1) + 0.5).astype(np.uint8)
+
+
+def _enlarge(pixels: np.ndarray, zoom: int):
+    from PIL import Image
+
+    image = Image.fromarray(pixels)
+    return image.resize((image.width * zoom, image.height * zoom), Image.Resampling.BICUBIC)
+
+
+def _colors(strands: Strands, color_by: str) -> np.ndarray:
+    """RGB (M, 3) uint8 of each curve: hues a golden angle apart, infill gray."""
+    hues = [colorsys.hsv_to_rgb(i * 0.618034 % 1.0 if color_by == "strand" else 0.11, 0.75, 1.0) for i in range(len(strands))]
+    colors = (255 * np.array(hues).reshape(-1, 3)).astype(np.uint8)
+    colors[strands.kind == INFILL] = INFILL_COLOR
+    return colors
+
+
+def _draw(image, segments: np.ndarray, colors: np.ndarray, zoom: int):
+    """The image with segments (S, 2, 2) of a channel plane's pixels drawn over it, in colors (S, 3), anti-aliased."""
+    from PIL import Image, ImageDraw
+
+    layer = Image.new("RGBA", (image.width * SMOOTH, image.height * SMOOTH))
+    pen = ImageDraw.Draw(layer)
+    for ends, color in zip((segments + 0.5) * zoom * SMOOTH, colors, strict=True):
+        pen.line([*map(tuple, ends)], fill=(*color.tolist(), 255), width=round(1.5 * SMOOTH))
+    layer = layer.resize(image.size, Image.Resampling.BOX)
+    return Image.alpha_composite(image.convert("RGBA"), layer).convert("RGB")
+
+
+def _write(image, where: tuple[int, int], text: str) -> None:
+    from PIL import ImageDraw, ImageFont
+
+    ImageDraw.Draw(image).text(where, text, fill=(220, 220, 220), font=ImageFont.load_default(14))
