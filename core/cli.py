@@ -20,6 +20,7 @@ from .errors import StrandscopeError
 from .files import atomic, explain
 
 PATH = click.Path(path_type=Path)
+POSITIVE = click.FloatRange(min=0, min_open=True)
 PRESETS = ("auto", "straight", "wavy", "curls")
 FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
 
@@ -127,6 +128,48 @@ class Memory(click.ParamType):
         return int(float(match[1]) * 1000 ** " KMGT".index(match[2].upper() or " "))
 
 
+class Numbers(click.ParamType):
+    """FIRST:LAST:STEP (both ends included), or numbers with commas; with counts, a single whole number is a count (int)."""
+
+    name = "numbers"
+
+    def __init__(self, counts: bool = False):
+        self.counts = counts
+
+    def convert(self, value, param, ctx):
+        if not isinstance(value, str):
+            return value
+        try:
+            if self.counts and value.isdigit() and int(value) > 0:
+                return int(value)
+            if ":" in value:
+                first, last, step = (float(part) for part in value.split(":"))
+                count = round((last - first) / step) + 1
+                if count < 1 or count > 1_000_000 or abs(first + (count - 1) * step - last) > 1e-6 * abs(step):
+                    self.fail(f"{value!r}: no whole number of steps leads from {first:g} to {last:g}", param, ctx)
+                return tuple(round(first + i * step, 9) for i in range(count))
+            numbers = tuple(float(part) for part in value.split(",") if part.strip())
+        except (ValueError, ZeroDivisionError, OverflowError):
+            numbers = ()
+        if not numbers or not all(abs(number) < 1e9 for number in numbers):
+            self.fail(f"{value!r} is no list of numbers; expected FIRST:LAST:STEP or A,B,C", param, ctx)
+        return numbers
+
+
+class MosaicType(click.ParamType):
+    """PATTERN:BLACK:WHITE of a bare mosaic."""
+
+    name = "mosaic"
+
+    def convert(self, value, param, ctx):
+        from .raw import Mosaic
+
+        match = re.fullmatch(r"([RGB]{4}):(\d+):(\d+)", value)
+        if not match or sorted(match[1]) != list("BGGR") or not int(match[2]) < int(match[3]) <= 65535:
+            self.fail(f"{value!r} does not describe a mosaic; expected PATTERN:BLACK:WHITE, as in RGGB:512:15871", param, ctx)
+        return Mosaic(match[1], int(match[2]), int(match[3]))
+
+
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(version=version(), message="%(version)s")
 @common
@@ -171,6 +214,109 @@ def simulate(session, out, style, scale, fibers, seed):
     choices = {"style": style, "seed": seed} | ({"fibers": fibers} if fibers else {})
     simulator.simulate(out, replace(simulator.SCALES[scale], **choices), session.report)
     session.report.done(out)
+
+
+@main_group.command("import", short_help="Turn a folder of photographs into a capture.")
+@click.argument("folder", type=PATH)
+@click.option("-o", "--output", "out", type=PATH, required=True, metavar="CAPTURE", help="The capture to make: a folder. It may be FOLDER itself.")
+@click.option(
+    "--pattern",
+    help='How the photographs are named below FOLDER, as in "sweep_{angle}/img_{index}.cr2"; {angle}, {sweep}, '
+    "{position} and {index} stand for numbers, * for anything.",
+)
+@click.option("--csv", "table", type=PATH, help="A table with the columns file, angle_deg, position_mm, in place of folders and patterns.")
+@click.option(
+    "--order",
+    type=click.Choice(["name", "time"]),
+    default="name",
+    show_default=True,
+    help="Put the photographs in the order of their names (img_2 before img_10), or of the time in the files (EXIF).",
+)
+@click.option(
+    "--angles",
+    type=Numbers(counts=True),
+    help="Angles of the sweeps: FIRST:LAST:STEP, or A,B,C, or how many there are evenly around.  [default: evenly around]",
+)
+@click.option("--positions", type=Numbers(), help="Positions of the photographs of a sweep in mm: FIRST:LAST:STEP, or A,B,C.")
+@click.option(
+    "--first-mm",
+    type=float,
+    help="Position of the first photograph of each sweep: from the axis of the turntable to the plane of "
+    "focus, positive towards the camera.  [default: sweeps are centred on the axis]",
+)
+@click.option("--step-mm", type=float, help="From each position to the next; negative if the camera moves away.")
+@click.option("--working-distance-mm", type=POSITIVE, default=330.0, show_default=True, help="From the lens to the plane of focus.")
+@click.option("--pitch-mm", type=POSITIVE, help="Width of a pixel of a channel plane (two of the sensor) on the plane of focus.  [default: 1/35]")
+@click.option("--pixels-per-mm", type=POSITIVE, help="The same, the other way round.")
+@click.option("--axis-col-px", type=float, help="Column of the turntable's axis in a channel plane.  [default: the middle]")
+@click.option("--axis-row-px", type=float, help="Row where the optical axis meets a channel plane.  [default: the middle]")
+@click.option("--cone-deg", type=POSITIVE, default=10.0, show_default=True, help="Full angle of the cone of rays through the lens.")
+@click.option("--turntable", type=click.Path(), metavar="SUBFOLDER", help="Subfolder with photographs at a small aperture, evenly around.")
+@click.option("--f-number", type=POSITIVE, default=16.0, show_default=True, help="Aperture of the turntable photographs.")
+@click.option("--mosaic", type=MosaicType(), help="For bare .npy mosaics: PATTERN:BLACK:WHITE, as in RGGB:512:15871.")
+@click.option("--name", help="What was photographed.  [default: the folder's name]")
+@click.option(
+    "--copy",
+    is_flag=True,
+    help="Always copy the photographs into CAPTURE; otherwise they stay where they are if they lie in it, or "
+    "are hard links where the disk allows it.",
+)
+@click.option("--dry-run", is_flag=True, help="Check everything and say what was found, but write nothing.")
+@common
+@click.pass_obj
+def import_(
+    session,
+    folder,
+    out,
+    pattern,
+    table,
+    order,
+    angles,
+    positions,
+    first_mm,
+    step_mm,
+    working_distance_mm,
+    pitch_mm,
+    pixels_per_mm,
+    axis_col_px,
+    axis_row_px,
+    cone_deg,
+    turntable,
+    f_number,
+    mosaic,
+    name,
+    copy,
+    dry_run,
+):
+    """Turn a folder of photographs into a capture, which `strandscope reconstruct` understands.
+
+    FOLDER holds the sweeps: a subfolder for each angle of the turntable, with its photographs in the order of the camera's
+    positions. Raw files of the camera are best; linear EXR and TIFF will do. All are checked first, and FOLDER is not changed.
+
+    \b
+    Examples:
+      strandscope import photos -o lock --angles 0:345:15 --first-mm -37.5 --step-mm 0.2
+      strandscope import photos -o lock --pattern "a{angle}/d{position}.nef" --pixels-per-mm 41.5
+      strandscope import photos -o lock --csv log.csv --dry-run
+    """  # fmt: skip
+    from . import importer
+
+    for pair in ((pattern, table, "--pattern", "--csv"), (pitch_mm, pixels_per_mm, "--pitch-mm", "--pixels-per-mm"),
+                 (positions, step_mm, "--positions", "--step-mm")):  # fmt: skip
+        if pair[0] is not None and pair[1] is not None:
+            raise click.UsageError(f"{pair[2]} and {pair[3]} exclude each other")
+    layout = importer.Layout(
+        angles_deg=angles, positions_mm=positions, first_mm=first_mm, step_mm=step_mm, name=name,
+        working_distance_mm=working_distance_mm, pitch_mm=pitch_mm or 1 / (pixels_per_mm or 35.0), axis_col_px=axis_col_px,
+        axis_row_px=axis_row_px, aperture_cone_deg=cone_deg, mosaic=mosaic, turntable_f_number=f_number,
+    )  # fmt: skip
+    source = importer.Source(folder, pattern, table, order == "time", turntable)
+    plan = importer.plan_import(source, out, layout, keep_in_place=not copy, progress=session.report)
+    session.report.show(terminal.table(importer.describe(plan)))
+    if dry_run:
+        session.report.show("Nothing was written (--dry-run).")
+    else:
+        session.report.done(importer.carry_out(plan, copy=copy, progress=session.report))
 
 
 @main_group.command(short_help="Find the hairs in a capture, write them as curves.")
@@ -277,7 +423,7 @@ def stats(session, strands, json_file):
 @main_group.command(short_help="Compare found hairs with the hairs that are there.")
 @click.argument("strands", type=PATH)
 @click.argument("truth", type=PATH)
-@click.option("--tolerance-mm", type=click.FloatRange(min=0, min_open=True), default=0.1, show_default=True, help="How near counts as found.")
+@click.option("--tolerance-mm", type=POSITIVE, default=0.1, show_default=True, help="How near counts as found.")
 @click.option("--json", "json_file", type=PATH, help="Write the numbers to this file too.")
 @common
 @click.pass_obj

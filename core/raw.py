@@ -17,6 +17,10 @@ from .errors import CaptureError
 from .files import atomic
 
 LINEAR_SUFFIXES = {".exr", ".tif", ".tiff"}
+RAW_SUFFIXES = {
+    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".iiq", ".kdc", ".mef", ".mos", ".mrw", ".nef", ".nrw"),
+    *(".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
+}
 CAMERA_NAME = "Virtual macro camera"
 # Of the virtual camera: XYZ (D65) -> R, G, B, and its response to a neutral. They matter to raw developers only.
 _COLOR_MATRIX = (2.4967, -1.0463, -0.3736, -0.4291, 1.3896, 0.0811, -0.0643, 0.1044, 0.7407)
@@ -49,6 +53,72 @@ def read_planes(path: Path, channels: str = "R", mosaic: Mosaic | None = None) -
     if suffix in LINEAR_SUFFIXES:
         return _linear_planes(path, channels)
     return _raw_planes(path, channels)
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a photograph says of itself without its light being read."""
+
+    rows: int  # of the mosaic or image
+    cols: int
+    taken: tuple[float, int] | None  # seconds and shot number, in the order of taking; None where the file does not tell
+
+
+def read_header(path: Path) -> Header:
+    """Size and time of a photograph, without decoding it: a millisecond or two.
+
+    Raises CaptureError for a file that is missing, of no known kind, or ends before its own table of contents says.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CaptureError(f"{path}: the photograph is missing")
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        return Header(*_load_npy(path).shape, taken=None)
+    if suffix in LINEAR_SUFFIXES:
+        return Header(*_linear_size(path), taken=None)
+    _expect_whole(path)
+    import rawpy
+
+    try:
+        with _quiet_stderr(), rawpy.RawPy() as raw:
+            raw.open_file(str(path))
+            when = raw.other
+            taken = (when.timestamp.timestamp(), when.shot_order) if when.timestamp.year > 1970 else None
+            return Header(raw.sizes.height, raw.sizes.width, taken)
+    except (rawpy.LibRawError, OSError, ValueError) as error:
+        raise CaptureError(f"{path}: LibRaw cannot read this photograph, it may be cut short or damaged ({_one_line(error)})") from error
+
+
+def _linear_size(path: Path) -> tuple[int, int]:
+    try:
+        if path.suffix.lower() == ".exr":
+            import OpenEXR
+
+            with OpenEXR.File(str(path), header_only=True) as exr:
+                low, high = exr.header()["dataWindow"]
+                return int(high[1] - low[1] + 1), int(high[0] - low[0] + 1)
+        import tifffile
+
+        with tifffile.TiffFile(path) as tiff:
+            return tiff.pages[0].shape[:2]
+    except Exception as error:  # both libraries raise their own and the standard kinds for damaged files
+        raise CaptureError(f"{path}: cannot be read as an image ({_one_line(error)})") from error
+
+
+def _expect_whole(path: Path) -> None:
+    """Raise CaptureError if a raw file that is built like a TIFF (DNG, CR2, NEF, ARW, …) ends before its image does."""
+    import tifffile
+
+    try:
+        with _quiet_stderr(), tifffile.TiffFile(path) as tiff:
+            pages = [page for top in tiff.pages for page in (top, *(top.pages or ()))]
+            ends = [o + n for page in pages for o, n in zip(page.dataoffsets, page.databytecounts, strict=False)]
+    except Exception:  # not built like a TIFF, or with a dialect of its own: LibRaw will say
+        return
+    size = path.stat().st_size
+    if ends and max(ends) > size:
+        raise CaptureError(f"{path}: the photograph is cut short; expected {max(ends)} bytes, found {size}")
 
 
 def _bayer_planes(mosaic, pattern, blacks, white, channels, path) -> np.ndarray:
