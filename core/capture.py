@@ -4,6 +4,7 @@ A capture is a folder with ``capture.json`` and photographs; nothing in it is re
 """
 
 import json
+import re
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -78,7 +79,7 @@ def load_capture(path: Path) -> Capture:
         raise CaptureError(f"{path}: not found; expected a capture folder with a {FILE_NAME} in it (`strandscope import` makes one)")
     try:
         head = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # also for bytes that are not UTF-8
         raise CaptureError(f"{path}: not valid JSON: {error}") from error
     return _Reader(path).capture(head)
 
@@ -173,7 +174,7 @@ class _Reader:
         return values[name]
 
     def _number(self, value, where: str) -> float:
-        good = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
+        good = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12  # not NaN either
         self._expect(good, where, value, "a number")
         return float(value)
 
@@ -190,8 +191,9 @@ class _Reader:
     def _file(self, name, where: str) -> str:
         expected = "a path inside the capture's folder, with forward slashes"
         self._expect(isinstance(name, str) and name != "", where, name, expected)
+        self._expect(not re.search(r"[\x00-\x1f\x7f\ud800-\udfff]", name), where, name, expected)
         outside = ".." in PurePosixPath(name).parts or PurePosixPath(name).is_absolute() or PureWindowsPath(name).drive
-        self._expect(not outside and "\\" not in name and "\0" not in name, where, name, expected)
+        self._expect(not outside and "\\" not in name, where, name, expected)
         inside = (self.path.parent / name).resolve().is_relative_to(self.path.parent.resolve())
         self._expect(inside, where, name, f"{expected} (a link leads out of it)")
         return name
@@ -207,5 +209,5 @@ class _Reader:
 
     def _expect(self, good: bool, where: str, found, expected: str) -> None:
         if not good:
-            shown = json.dumps(found, default=str) if not isinstance(found, str) else found
+            shown = found if isinstance(found, str) and found.isprintable() else json.dumps(found, default=str)
             raise CaptureError(f"{self.path}: {where} is {shown[:60]}; expected {expected}")

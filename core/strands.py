@@ -164,7 +164,7 @@ def load_arrays(path: Path, required: tuple[str, ...]) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise StrandsError(f"{path}: not found; expected an .npz file")
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = dict(archive)
     except Exception as error:  # zipfile, zlib and numpy each raise their own for damaged files
         raise StrandsError(f"{path}: not a complete .npz file ({' '.join(str(error).split())})") from error

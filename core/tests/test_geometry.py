@@ -1,0 +1,80 @@
+"""Axes and signs, against numbers worked out by hand and against the laws they must obey."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numba import njit
+from strandscope.core import geometry
+from strandscope.core.geometry import Optics, camera_points, object_points, pixels, project, slope, to_image, to_pixel
+
+MM = st.floats(-40, 40)
+OPTICS = Optics(working_distance_mm=330.0, pitch_mm=1 / 35, axis_col_px=1096.5, axis_row_px=731.0, aperture_cone_deg=10.0)
+
+
+@pytest.mark.parametrize(
+    ("point", "angle_deg", "expected"),
+    [
+        ((1, 2, 3), 0, (1, 2, 3)),
+        ((0, 0, 1), 90, (1, 0, 0)),  # what was nearest to the camera has turned to its right
+        ((1, 0, 0), 90, (0, 0, -1)),  # and what was right, to the far side
+        ((1, 5, 0), 180, (-1, 5, 0)),
+        ((2, 0, 2), 45, (2 * np.sqrt(2), 0, 0)),
+    ],
+)
+def test_the_turntable_turns_right_handed_about_y(point, angle_deg, expected):
+    np.testing.assert_allclose(camera_points(point, angle_deg), expected, atol=1e-12)
+
+
+@given(st.tuples(MM, MM, MM), st.floats(-720, 720))
+def test_turning_back_undoes_turning_and_keeps_lengths(point, angle_deg):
+    turned = camera_points(point, angle_deg)
+    np.testing.assert_allclose(object_points(turned, angle_deg), point, atol=1e-9)
+    assert np.linalg.norm(turned) == pytest.approx(np.linalg.norm(point), abs=1e-9)
+
+
+@given(MM, MM, MM)
+def test_a_point_in_focus_is_where_it_appears(u, v, d):
+    assert project(u, v, d, d, 330.0) == pytest.approx((u, v))
+
+
+def test_perspective_by_hand():
+    # 10 mm nearer than the plane of focus, which is 330 mm from the lens: 320 mm, seen larger by 330 / 320
+    assert project(3.2, -6.4, 10.0, 0.0, 330.0) == pytest.approx((3.3, -6.6))
+    assert project(3.2, -6.4, 15.0, 5.0, 330.0) == pytest.approx((3.3, -6.6))
+
+
+@given(MM, MM, MM)
+def test_slope_is_how_the_image_moves_with_the_camera(u, v, d):
+    step = 1e-4
+    ahead, behind = (np.array(project(u, v, d, d + side * step, 330.0)) for side in (1, -1))
+    np.testing.assert_allclose((ahead - behind) / (2 * step), slope(u, v, 330.0)[:2], atol=1e-6)
+    assert slope(u, v, 330.0)[2] == 1.0
+
+
+def test_right_is_up_the_columns_and_up_is_down_the_rows():
+    assert to_pixel(1.0, 0.0, 1 / 35, 100.0, 50.0) == pytest.approx((135.0, 50.0))
+    assert to_pixel(0.0, 1.0, 1 / 35, 100.0, 50.0) == pytest.approx((100.0, 15.0))
+
+
+@given(st.floats(-10, 3000), st.floats(-10, 3000))
+def test_pixels_and_millimetres_are_inverse(col, row):
+    assert to_pixel(*to_image(col, row, 1 / 35, 1096.5, 731.0), 1 / 35, 1096.5, 731.0) == pytest.approx((col, row), abs=1e-9)
+
+
+def test_a_point_on_the_axis_keeps_its_column_while_the_turntable_turns():
+    seen = [pixels([[0.0, 4.0, 0.0]], angle, 0.0, OPTICS)[0] for angle in range(0, 360, 15)]
+    np.testing.assert_allclose(seen, np.tile([1096.5, 731.0 - 140.0, 0.0], (24, 1)), atol=1e-9)
+
+
+def test_arrays_of_any_shape_agree_with_single_points():
+    points = np.random.default_rng(0).normal(size=(2, 3, 3))
+    whole = pixels(points, 30.0, 1.5, OPTICS)
+    for i, j in np.ndindex(2, 3):
+        np.testing.assert_allclose(whole[i, j], pixels(points[i, j], 30.0, 1.5, OPTICS))
+
+
+def test_kernels_compile_the_same_formulas():
+    assert njit(geometry.turn)(1.0, 2.0, 3.0, 0.6, 0.8) == pytest.approx(geometry.turn(1.0, 2.0, 3.0, 0.6, 0.8))
+    assert njit(geometry.turn_back)(1.0, 2.0, 3.0, 0.6, 0.8) == pytest.approx(geometry.turn_back(1.0, 2.0, 3.0, 0.6, 0.8))
+    assert njit(geometry.project)(1.0, 2.0, 3.0, 0.5, 330.0) == pytest.approx(project(1.0, 2.0, 3.0, 0.5, 330.0))

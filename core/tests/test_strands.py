@@ -1,0 +1,124 @@
+"""Strands files: whole, finite, reproducible to the byte; and the numbers that are taken of them."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strandscope.core.errors import StrandsError
+from strandscope.core.strands import CAPTURED, INFILL, Strands, concatenate, describe, lengths, load_strands, offsets_of, save_strands, statistics
+
+
+def make(curves, kind=None):
+    """Strands of a list of (n, 3) curves."""
+    points = np.concatenate(curves).astype(np.float32)
+    kinds = np.zeros(len(curves), np.uint8) if kind is None else np.asarray(kind, np.uint8)
+    sizes = [len(curve) for curve in curves]
+    return Strands(points, offsets_of(sizes), np.full(len(points), 0.04, np.float32), kinds, np.ones(len(points), np.float32), {"capture": "x"})
+
+
+def vertical(x, low, high, n=5):
+    return np.stack([np.full(n, x), np.linspace(low, high, n), np.zeros(n)], axis=1)
+
+
+@settings(max_examples=25, deadline=None)
+@given(sizes=st.lists(st.integers(2, 9), max_size=6), seed=st.integers(0, 99))
+def test_what_is_saved_is_loaded_and_the_bytes_are_the_same(tmp_path_factory, sizes, seed):
+    rng = np.random.default_rng(seed)
+    n = sum(sizes)
+    points, radius, confidence = rng.normal(size=(n, 3)), rng.uniform(0.01, 0.1, n), rng.uniform(size=n)
+    strands = Strands(
+        *(points.astype(np.float32), offsets_of(np.array(sizes, int)), radius.astype(np.float32)),
+        *(rng.integers(0, 2, len(sizes)).astype(np.uint8), confidence.astype(np.float32), {"b": 1, "a": "ü"}),
+    )
+    folder = tmp_path_factory.mktemp("strands")
+    for name in ("one.npz", "two.npz"):
+        save_strands(folder / name, strands)
+    loaded = load_strands(folder / "one.npz")
+    for field in ("points_mm", "offsets", "radius_mm", "kind", "confidence"):
+        np.testing.assert_array_equal(getattr(loaded, field), getattr(strands, field))
+        assert getattr(loaded, field).dtype == getattr(strands, field).dtype
+    assert loaded.provenance == strands.provenance
+    assert (folder / "one.npz").read_bytes() == (folder / "two.npz").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("array", "change", "said"),
+    [
+        ("points", lambda a: np.where(np.arange(a.size).reshape(a.shape) == 4, np.nan, a), r"points\[1, 1\] is nan"),
+        ("points", lambda a: a[:, :2], "points .*shape"),
+        ("radius", lambda a: 0 * a, "radius"),
+        ("radius", lambda a: a * np.inf, r"radius\[0\] is inf"),
+        ("confidence", lambda a: a[:-1], "confidence"),
+        ("offsets", lambda a: a[::-1].copy(), "offsets"),
+        ("offsets", lambda a: a + 0.5, "offsets"),
+        ("offsets", lambda a: np.r_[a[:-1], a[-1] + 1], "offsets"),
+        ("offsets", lambda a: a[:0], "offsets"),
+        ("offsets", lambda _: np.array(3), "offsets"),
+        ("kind", lambda a: a + 7, "kind"),
+        ("provenance", lambda _: np.array("{"), "provenance"),
+    ],
+)
+def test_a_bad_array_is_named(tmp_path, array, change, said):
+    save_strands(tmp_path / "good.npz", make([vertical(0, 0, 1), vertical(1, 0, 1)]))
+    arrays = dict(np.load(tmp_path / "good.npz"))
+    arrays[array] = change(arrays[array])
+    np.savez(tmp_path / "bad.npz", **arrays)
+    with pytest.raises(StrandsError, match=rf"bad\.npz: {said}.*") as error:
+        load_strands(tmp_path / "bad.npz")
+    assert len(str(error.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.95])
+def test_a_file_that_is_cut_short_is_refused(tmp_path, share):
+    path = tmp_path / "cut.npz"
+    save_strands(path, make([vertical(0, 0, 1)]))
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(StrandsError, match=r"cut\.npz: not a complete \.npz file"):
+        load_strands(path)
+
+
+def test_nans_are_not_written(tmp_path):
+    strands = make([vertical(np.nan, 0, 1)])
+    with pytest.raises(StrandsError, match="nan"):
+        save_strands(tmp_path / "nan.npz", strands)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_points_and_offsets_are_enough(tmp_path):
+    np.savez(tmp_path / "least.npz", points=np.eye(3), offsets=np.array([0, 3]))
+    strands = load_strands(tmp_path / "least.npz")
+    assert (len(strands), strands.kind[0], strands.confidence[0]) == (1, CAPTURED, 1.0)
+
+
+def test_curves_are_chosen_whole():
+    strands = make([vertical(0, 0, 1), vertical(1, 0, 2, 7), vertical(2, 0, 3)], kind=[CAPTURED, INFILL, CAPTURED])
+    np.testing.assert_array_equal(strands.captured.offsets, [0, 5, 10])
+    np.testing.assert_array_equal(strands.captured[1], strands[2])
+    again = concatenate([strands.select(np.array([True, False, False])), strands.select(np.array([False, True, True]))], {})
+    np.testing.assert_array_equal(again.points_mm, strands.points_mm)
+    np.testing.assert_array_equal(again.offsets, strands.offsets)
+
+
+def test_lengths_do_not_run_from_curve_to_curve():
+    strands = make([vertical(0, 0, 1), vertical(100, 0, 2.5), vertical(-100, 4, 3)])
+    np.testing.assert_allclose(lengths(strands.points_mm, strands.offsets), [1.0, 2.5, 1.0], rtol=1e-6)
+
+
+def test_statistics_of_hair_that_can_be_counted_by_hand():
+    # 10 mm high; three curves all the way, one through half, and one that goes up and comes down again in the upper half
+    hook = np.array([[5, 5, 0], [5, 10, 0], [6, 10, 0], [6, 5, 0]], float)
+    strands = make([vertical(x, 0, 10) for x in range(3)] + [vertical(4, 0, 5), hook, vertical(9, -50, 50)], kind=[0, 0, 0, 0, 0, INFILL])
+    numbers = statistics(strands)
+    assert numbers["curves"] == 5
+    assert numbers["infill_curves"] == 1
+    assert numbers["height_mm"] == pytest.approx(10)
+    assert numbers["mean_curves_crossing_a_horizontal_plane"] == pytest.approx(4.0)  # 3 and one of the other two everywhere
+    assert numbers["length_mm"] == pytest.approx({"total": 46.0, "mean": 9.2, "median": 10.0, "longest": 11.0})
+    assert numbers["infill_length_mm"] == pytest.approx(100)
+    assert len(describe(numbers)) > 5
+
+
+def test_statistics_of_no_hair_at_all():
+    numbers = statistics(make([vertical(0, 0, 1)]).select(np.array([False])))
+    assert numbers["curves"] == 0
+    assert numbers["mean_curves_crossing_a_horizontal_plane"] == 0
