@@ -2,11 +2,11 @@
 
 import sys
 
-from .core.cli import run
+from .addon.cli import run_all
 
 
 def main() -> None:
-    sys.exit(run(sys.argv[1:]))
+    sys.exit(run_all(sys.argv[1:]))
 
 
 if __name__ == "__main__":

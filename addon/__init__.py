@@ -1,0 +1,1 @@
+"""Strandscope in Blender."""

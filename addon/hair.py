@@ -1,0 +1,161 @@
+"""Strands <-> hair in Blender: one ``Curves`` object, every value in bulk.
+
+The transform between the object frame (mm, y up) and Blender (m, z up) stands here and nowhere else: 1 mm is 0.001 m and
+(x, y, z) becomes (x, -z, y). Positions and radii are float32 on both sides, so a round trip gives back every number to
+the last bit but one; identities, kinds and confidences are kept exactly.
+"""
+
+import json
+
+import bpy
+import numpy as np
+
+from ..core.errors import StrandscopeError
+from ..core.strands import CAPTURED, Strands
+
+METRES_PER_MM = 0.001
+PROVENANCE = "strandscope_provenance"  # custom property of the curves, JSON
+SHOW = "Strandscope Show"  # modifier and node group that hide captured hair or infill
+
+# name -> (type, domain, property, dtype) of what an attribute holds
+_ATTRIBUTES = {
+    "position": ("FLOAT_VECTOR", "POINT", "vector", np.float32),
+    "radius": ("FLOAT", "POINT", "value", np.float32),
+    "confidence": ("FLOAT", "POINT", "value", np.float32),
+    "strand_id": ("INT", "CURVE", "value", np.int32),
+    "kind": ("INT8", "CURVE", "value", np.int8),
+}
+
+
+def to_blender(points_mm: np.ndarray) -> np.ndarray:
+    """Points (..., 3) mm of the object frame -> (..., 3) float32, m, z up."""
+    x, y, z = np.moveaxis(np.asarray(points_mm, np.float64), -1, 0)
+    return (METRES_PER_MM * np.stack([x, -z, y], axis=-1)).astype(np.float32)
+
+
+def from_blender(points: np.ndarray) -> np.ndarray:
+    """Points (..., 3) m, z up -> (..., 3) float32, mm of the object frame: the inverse of ``to_blender``."""
+    x, y, z = np.moveaxis(np.asarray(points, np.float64), -1, 0)
+    return (np.stack([x, z, -y], axis=-1) / METRES_PER_MM).astype(np.float32)
+
+
+def add_hair(strands: Strands, name: str = "Hair", collection: bpy.types.Collection | None = None) -> bpy.types.Object:
+    """A new hair object with all strands, linked to ``collection`` (the scene's if None).
+
+    Poly curves with the point attributes radius (m) and confidence and the curve attributes strand_id and kind (0 captured,
+    1 infill); where the strands came from is a custom property. A modifier with two switches shows each kind or not.
+    Raises StrandscopeError if there are no strands.
+    """
+    if len(strands) == 0:
+        raise StrandscopeError(f"{name}: there are no strands to make hair of")
+    curves = bpy.data.hair_curves.new(name)
+    curves.add_curves(np.diff(strands.offsets).tolist())
+    curves.set_types(type="POLY")
+    for attribute, values in {
+        "position": to_blender(strands.points_mm),
+        "radius": METRES_PER_MM * strands.radius_mm.astype(np.float64),
+        "confidence": strands.confidence,
+        "strand_id": np.arange(len(strands)),
+        "kind": strands.kind,
+    }.items():
+        _write(curves, attribute, values)
+    curves[PROVENANCE] = json.dumps(strands.provenance, sort_keys=True)
+    hair = bpy.data.objects.new(name, curves)
+    (collection or bpy.context.scene.collection).objects.link(hair)
+    _add_switches(hair)
+    return hair
+
+
+def strands_of(hair: bpy.types.Object) -> Strands:
+    """The strands of a hair object, as ``add_hair`` got them. Attributes that are missing take a plain value.
+
+    Reads the curves themselves, before modifiers. Raises StrandscopeError for an object that is no hair.
+    """
+    if hair is None or hair.type != "CURVES":
+        raise StrandscopeError(f"{hair.name if hair else 'nothing'}: is no hair; expected a hair curves object")
+    curves = hair.data
+    offsets = np.empty(len(curves.curves) + 1, np.int32)
+    curves.curve_offset_data.foreach_get("value", offsets)
+    return Strands(
+        points_mm=from_blender(_read(curves, "position").reshape(-1, 3)),
+        offsets=offsets.astype(np.int64),
+        radius_mm=(_read(curves, "radius", 4e-5).astype(np.float64) / METRES_PER_MM).astype(np.float32),
+        kind=_read(curves, "kind", CAPTURED).astype(np.uint8),
+        confidence=_read(curves, "confidence", 1),
+        provenance=json.loads(curves.get(PROVENANCE, "{}")),
+    )
+
+
+def is_hair(hair: bpy.types.Object | None) -> bool:
+    """Whether an object is hair that Strandscope made."""
+    return hair is not None and hair.type == "CURVES" and PROVENANCE in hair.data
+
+
+def switches(hair: bpy.types.Object):
+    """The inputs (captured, infill) of the modifier that shows each kind or not, or None. Each has a boolean ``value``."""
+    modifier = hair.modifiers.get(SHOW)
+    if modifier is None or modifier.node_group is None:
+        return None
+    sockets = {item.name: item.identifier for item in modifier.node_group.interface.items_tree if item.item_type == "SOCKET"}
+    inputs = modifier.properties.inputs
+    return tuple(getattr(inputs, sockets[name]) for name in ("Captured", "Infill"))
+
+
+def _write(curves, name: str, values: np.ndarray) -> None:
+    """Values, one an element, to an attribute; made with the type and domain of the table above."""
+    kind, domain, prop, dtype = _ATTRIBUTES[name]
+    attribute = curves.attributes.get(name) or curves.attributes.new(name, kind, domain)
+    attribute.data.foreach_set(prop, np.ascontiguousarray(values, dtype).ravel())
+
+
+def _read(curves, name: str, missing: float = 0) -> np.ndarray:
+    """The flat values of an attribute, all ``missing`` where there is none."""
+    _, domain, prop, dtype = _ATTRIBUTES[name]
+    attribute = curves.attributes.get(name)
+    count = (len(curves.points) if domain == "POINT" else len(curves.curves)) * (3 if prop == "vector" else 1)
+    values = np.full(count, missing, dtype)
+    if attribute is not None:
+        attribute.data.foreach_get(prop, values)
+    return values
+
+
+def _add_switches(hair: bpy.types.Object) -> None:
+    modifier = hair.modifiers.new(SHOW, "NODES")
+    modifier.node_group = bpy.data.node_groups.get(SHOW) or _switch_group()
+    modifier.show_group_selector = False
+
+
+def _switch_group() -> bpy.types.NodeTree:
+    """Geometry nodes that delete the curves of a kind (attribute ``kind``) whose switch is off."""
+    group = bpy.data.node_groups.new(SHOW, "GeometryNodeTree")
+    group.is_modifier = True
+    group.interface.new_socket("Hair", in_out="INPUT", socket_type="NodeSocketGeometry")
+    for name, text in (("Captured", "Show the hairs that were photographed"), ("Infill", "Show the hairs that were added inside")):
+        socket = group.interface.new_socket(name, description=text, in_out="INPUT", socket_type="NodeSocketBool")
+        socket.default_value = True
+    group.interface.new_socket("Hair", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+
+    def node(kind, column, row, **settings):
+        new = group.nodes.new(kind)
+        new.location = (200 * column, -180 * row)
+        for key, value in settings.items():
+            setattr(new, key, value)
+        return new
+
+    entry, leave = node("NodeGroupInput", 0, 0), node("NodeGroupOutput", 4, 0)
+    kind = node("GeometryNodeInputNamedAttribute", 0, 1, data_type="INT")
+    kind.inputs["Name"].default_value = "kind"
+    shown = node("GeometryNodeSwitch", 1, 0, input_type="BOOLEAN", label="Shown: infill or captured")
+    hidden = node("FunctionNodeBooleanMath", 2, 0, operation="NOT")
+    delete = node("GeometryNodeDeleteGeometry", 3, 0, domain="CURVE")
+    for source, target in (
+        (kind.outputs["Attribute"], shown.inputs["Switch"]),
+        (entry.outputs["Captured"], shown.inputs["False"]),
+        (entry.outputs["Infill"], shown.inputs["True"]),
+        (shown.outputs[0], hidden.inputs[0]),
+        (hidden.outputs[0], delete.inputs["Selection"]),
+        (entry.outputs["Hair"], delete.inputs["Geometry"]),
+        (delete.outputs["Geometry"], leave.inputs["Hair"]),
+    ):
+        group.links.new(source, target)
+    return group
