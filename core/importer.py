@@ -202,7 +202,7 @@ def _expression(pattern: str) -> tuple[re.Pattern, list[str]]:
     names, text = [], ""
     for part in re.split(r"(\{\w*\}|\*)", pattern.replace("\\", "/")):
         if part == "*":
-            text += "[^/]*"
+            text += "[^/]*?"  # as little as possible, so that numbers are taken whole
         elif part.startswith("{"):
             if part[1:-1] not in FIELDS or part[1:-1] in names:
                 raise StrandscopeError(f"the pattern {pattern!r} has {part}; expected each of {{{'}, {'.join(FIELDS)}}} at most once")
