@@ -11,10 +11,10 @@ import bpy
 import numpy as np
 
 from ..core.errors import StrandscopeError
-from ..core.strands import CAPTURED, Strands
+from ..core.strands import CAPTURED, Strands, statistics
 
 METRES_PER_MM = 0.001
-PROVENANCE = "strandscope_provenance"  # custom property of the curves, JSON
+PROVENANCE, STATISTICS = "strandscope_provenance", "strandscope_statistics"  # custom properties of the curves, JSON
 SHOW = "Strandscope Show"  # modifier and node group that hide captured hair or infill
 
 # name -> (type, domain, property, dtype) of what an attribute holds
@@ -60,6 +60,7 @@ def add_hair(strands: Strands, name: str = "Hair", collection: bpy.types.Collect
     }.items():
         _write(curves, attribute, values)
     curves[PROVENANCE] = json.dumps(strands.provenance, sort_keys=True)
+    curves[STATISTICS] = json.dumps(statistics(strands))
     hair = bpy.data.objects.new(name, curves)
     (collection or bpy.context.scene.collection).objects.link(hair)
     _add_switches(hair)
@@ -89,6 +90,20 @@ def strands_of(hair: bpy.types.Object) -> Strands:
 def is_hair(hair: bpy.types.Object | None) -> bool:
     """Whether an object is hair that Strandscope made."""
     return hair is not None and hair.type == "CURVES" and PROVENANCE in hair.data
+
+
+def describe(hair: bpy.types.Object) -> str:
+    """Lines that tell what hair of ``add_hair`` was made of."""
+    numbers = json.loads(hair.data.get(STATISTICS, "{}"))
+    if not numbers:
+        return hair.name
+    length = numbers["length_mm"]
+    lines = [
+        f"{numbers['curves']:,} captured, {numbers['infill_curves']:,} infill",
+        f"{length['mean']:.1f} mm long, the longest {length['longest']:.1f} mm",
+        f"{numbers['mean_curves_crossing_a_horizontal_plane']:.0f} side by side, {2 * numbers['mean_radius_mm']:.3f} mm thick",
+    ]
+    return "\n".join(lines)
 
 
 def switches(hair: bpy.types.Object):

@@ -1,0 +1,19 @@
+"""What the panel's buttons do. Each operator gathers, calls one function, hands over."""
+
+import bpy
+
+from . import bring_in, work
+
+_CLASSES = (*bring_in.CLASSES, *work.CLASSES)
+
+
+def register():
+    for cls in _CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.types.TOPBAR_MT_file_import.append(bring_in.menu)
+
+
+def unregister():
+    bpy.types.TOPBAR_MT_file_import.remove(bring_in.menu)
+    for cls in reversed(_CLASSES):
+        bpy.utils.unregister_class(cls)

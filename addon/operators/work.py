@@ -1,0 +1,125 @@
+"""Long work: reconstruction and comparison, each a job in a child process."""
+
+from pathlib import Path
+
+import bpy
+
+from ...core.errors import StrandscopeError
+from ...core.strands import load_strands, save_strands
+from .. import hair
+from ..jobs import Command, JobOperator
+from ..props import preferences
+from .bring_in import show_strands
+
+
+def _idle(cls, context) -> bool:
+    if context.window_manager.strandscope_job.running:
+        cls.poll_message_set("Another job is running; wait for it, or cancel it")
+        return False
+    return True
+
+
+def _captured(cls, context) -> bool:
+    settings = context.scene.strandscope
+    if settings.capture_name:
+        return True
+    cls.poll_message_set("The capture cannot be read, see above" if settings.capture_error else "Choose a capture first")
+    return False
+
+
+class STRANDSCOPE_OT_reconstruct(JobOperator, bpy.types.Operator):
+    """Find the hairs in the photographs, write them to the output file, and add them to the scene. Esc stops"""
+
+    bl_idname = "strandscope.reconstruct"
+    bl_label = "Reconstruct"
+    bl_options = {"UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        return _idle(cls, context) and _captured(cls, context)
+
+    def command(self, context) -> Command:
+        settings, user, out = context.scene.strandscope, preferences(context), context.scene.strandscope.output_file
+        if not settings.output_path or out.suffix != ".npz":
+            raise StrandscopeError(f"{settings.output_path or 'Output'}: expected a strands file to write, with a name that ends in .npz")
+        arguments = ["reconstruct", settings.capture_folder, "-o", out, "--preset", settings.preset, "--memory", f"{user.memory_gb:.1f}GB"]
+        if user.workers:
+            arguments += ["--workers", user.workers]
+        if not settings.infill:
+            arguments.append("--no-infill")
+        return Command("Reconstruction", tuple(map(str, arguments)), out.with_suffix(".log"))
+
+    def finish(self, context, output: Path) -> None:
+        strands = load_strands(output)
+        show_strands(context, strands, str(strands.provenance.get("capture") or context.scene.strandscope.capture_name)[:60])
+        self.report({"INFO"}, f"{len(strands)} strands, also in {output}")
+
+
+class STRANDSCOPE_OT_compare(JobOperator, bpy.types.Operator):
+    """Render the active hair as the photographs show it, and set both side by side in one picture. Esc stops"""
+
+    bl_idname = "strandscope.compare"
+    bl_label = "Render Comparison"
+
+    @classmethod
+    def poll(cls, context):
+        if not _idle(cls, context) or not _captured(cls, context):
+            return False
+        if not hair.is_hair(context.object):
+            cls.poll_message_set("Select hair that Strandscope made: reconstruct or import it")
+            return False
+        return True
+
+    def command(self, context) -> Command:
+        settings = context.scene.strandscope
+        folder = settings.output_file.parent / "comparison"
+        strands = folder / "strands.npz"
+        save_strands(strands, hair.strands_of(context.object))
+        arguments = ("turntable", settings.capture_folder, strands, folder, "--angles", settings.angles, "--size", settings.size,
+                     "--samples", settings.samples)  # fmt: skip
+        return Command("Comparison", tuple(map(str, arguments)), folder / "turntable.log", renders=True)
+
+    def finish(self, context, output: Path) -> None:
+        context.scene.strandscope.comparison = str(output)
+        self.report({"INFO"}, f"The comparison is in {output}")
+
+
+class STRANDSCOPE_OT_open_comparison(bpy.types.Operator):
+    """Show the picture that was rendered last, in a window of its own"""
+
+    bl_idname = "strandscope.open_comparison"
+    bl_label = "Open Picture"
+
+    @classmethod
+    def poll(cls, context):
+        cls.poll_message_set("Render a comparison first")
+        return bool(context.scene.strandscope.comparison)
+
+    def execute(self, context):
+        try:
+            image = bpy.data.images.load(context.scene.strandscope.comparison, check_existing=True)
+        except RuntimeError as error:
+            self.report({"ERROR"}, " ".join(str(error).split()))
+            return {"CANCELLED"}
+        image.reload()
+        if bpy.app.background:
+            return {"FINISHED"}
+        bpy.ops.wm.window_new()
+        area = context.window_manager.windows[-1].screen.areas[0]
+        area.type = "IMAGE_EDITOR"
+        area.spaces.active.image = image
+        return {"FINISHED"}
+
+
+class STRANDSCOPE_OT_cancel(bpy.types.Operator):
+    """Stop the job that is running; what it has done so far is kept, and the next run goes on from there"""
+
+    bl_idname = "strandscope.cancel"
+    bl_label = "Cancel"
+
+    def execute(self, context):
+        context.window_manager.strandscope_job.stop = True
+        return {"FINISHED"}
+
+
+CLASSES = (STRANDSCOPE_OT_reconstruct, STRANDSCOPE_OT_compare, STRANDSCOPE_OT_open_comparison, STRANDSCOPE_OT_cancel)
