@@ -72,11 +72,13 @@ def run(argv: list[str], group: click.Group | None = None) -> int:
 
     Whatever goes wrong is one line on stderr, ``strandscope: …``. A traceback is shown with --debug only.
     """
-    session = Session()
+    session, group = Session(), group or main_group
     try:
-        with terminal.interruptible():
-            code = (group or main_group).main(args=argv, prog_name="strandscope", standalone_mode=False, obj=session)
-        return code if isinstance(code, int) else 0
+        with terminal.interruptible(), group.make_context("strandscope", list(argv), obj=session) as context:
+            group.invoke(context)
+        return 0
+    except click.exceptions.Exit as end:  # --help and --version
+        return end.exit_code
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)
         return WRONG_USE
@@ -347,10 +349,10 @@ def reconstruct(session, capture, output, preset, params, method, infill, no_inf
     Example:
       strandscope reconstruct lock -o out/strands.npz --preset straight --no-infill
     """
-    from . import pipeline
-
     if infill is not None and no_infill:
         raise click.UsageError("--infill and --no-infill exclude each other")
+    from . import pipeline
+
     parameters = pipeline.read_toml(params) if params else pipeline.preset(preset)
     changes = {"method": method, "memory_bytes": memory}
     if no_infill or infill is not None:

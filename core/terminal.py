@@ -142,11 +142,12 @@ def interruptible() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def stop_with_parent() -> None:
@@ -158,7 +159,10 @@ def stop_with_parent() -> None:
                 pass
         except OSError:
             pass
-        signal.raise_signal(signal.SIGINT)
+        if hasattr(signal, "pthread_kill"):  # wakes the main thread from whatever it waits for
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+        else:
+            signal.raise_signal(signal.SIGINT)
         time.sleep(STOP_GRACE_S)
         os._exit(130)
 

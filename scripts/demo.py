@@ -15,6 +15,6 @@ step("2/7 Finding the hairs in the photographs …", *strandscope, "reconstruct"
 step("3/7 Comparing them with the hairs that are there …", *strandscope, "score", strands, truth, "--json", demo / "score.json")
 step("4/7 Counting and measuring …", *strandscope, "stats", strands, "--json", demo / "stats.json")
 step("5/7 Drawing them back onto a photograph …", *strandscope, "overlay", capture, strands, "-o", demo / "overlay.png")
-step("6/7 Making a Blender file …", *strandscope, "blend", strands, demo / "switch.blend")
+step("6/7 Making a Blender file …", *strandscope, "blend", strands, demo / "switch.blend", "--capture", capture)
 step("7/7 Rendering it beside the photograph …", *strandscope, "turntable", capture, strands, demo / "turntable.png")
 print(f"Done. Look at overlay.png and turntable.png in {demo}, and open switch.blend in Blender 5.2.")

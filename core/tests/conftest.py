@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from strandscope.core.raw import write_dng
 
 BLACK, WHITE = 512, 15871

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
 from strandscope.core.capture import Capture, Sweep, Turntable, load_capture, save_capture
 from strandscope.core.errors import CaptureError
 from strandscope.core.geometry import Optics

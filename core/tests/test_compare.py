@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from PIL import Image
+
 from strandscope.core.capture import load_capture
 from strandscope.core.compare import Shot, Truth, choose_shot, depth_of_field_mm, in_focus, load_truth, overlay, score, summary
 from strandscope.core.errors import StrandscopeError, StrandsError

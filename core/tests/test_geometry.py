@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numba import njit
+
 from strandscope.core import geometry
 from strandscope.core.geometry import Optics, camera_points, object_points, pixels, project, slope, to_image, to_pixel
 

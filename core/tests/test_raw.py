@@ -7,6 +7,7 @@ import pytest
 import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from strandscope.core.errors import CaptureError
 from strandscope.core.raw import Mosaic, read_header, read_planes, write_dng
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from strandscope.core.errors import StrandsError
 from strandscope.core.strands import CAPTURED, INFILL, Strands, concatenate, describe, lengths, load_strands, offsets_of, save_strands, statistics
 
