@@ -27,11 +27,12 @@ def python() -> Path:
         sys.exit(f"Strandscope needs Python 3.13; this is {sys.version.split()[0]}. On Windows: py -3.13 {sys.argv[0]}")
     inside = BIN / ("python.exe" if os.name == "nt" else "python")
     wanted = _stamp()
-    found = STAMP.read_text(encoding="utf-8") if STAMP.is_file() and inside.exists() else None
+    found = STAMP.read_text(encoding="utf-8") if STAMP.is_file() and inside.exists() else ""
     if found == wanted:
         return inside
-    print("Installing the packages of requirements.lock into .venv, once (some 2 GB; minutes) …" if found is None else "Updating .venv …", flush=True)
-    if found is None:  # nothing there, or an installation that was interrupted
+    here = found.endswith(f" {ROOT}\n")  # else there is nothing, a part of something, or programs that point elsewhere
+    print("Installing the packages of requirements.lock into .venv, once (some 2 GB; minutes) …" if not here else "Updating .venv …", flush=True)
+    if not here:
         shutil.rmtree(VENV, ignore_errors=True)
         _run([sys.executable, "-m", "venv", VENV], "the virtual environment .venv could not be made")
     STAMP.unlink(missing_ok=True)
@@ -55,7 +56,7 @@ def step(what: str, *command, quiet: bool = False) -> None:
     started = time.monotonic()
     print(what, end=" " if quiet else "\n", flush=True)
     output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "encoding": "utf-8", "errors": "replace"} if quiet else {}
-    result = subprocess.run([str(part) for part in command], cwd=ROOT, env=_environment(), check=False, **output)
+    result = _call(command, cwd=ROOT, **output)
     if quiet:
         print("failed" if result.returncode else "ok", f"({time.monotonic() - started:.0f} s)", flush=True)
     if result.returncode:
@@ -75,6 +76,13 @@ def _environment() -> dict:
     return {k: v for k, v in os.environ.items() if k not in {"PYTHONPATH", "PYTHONHOME", "PYTHONSTARTUP", "VIRTUAL_ENV"}}
 
 
+def _call(command, **options) -> subprocess.CompletedProcess:
+    try:
+        return subprocess.run([str(part) for part in command], env=_environment(), check=False, **options)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
 def _run(command: list, failed: str) -> None:
-    if subprocess.run([str(part) for part in command], env=_environment(), check=False).returncode:
+    if _call(command).returncode:
         sys.exit(f"Strandscope: {failed}.")
