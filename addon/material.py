@@ -10,7 +10,7 @@ DEFAULT_COLOR = "medium brown"
 ROUGHNESS, RADIAL_ROUGHNESS, IOR = 0.3, 0.35, 1.55
 TILT_RADIANS = 0.035  # of the cuticle's scales, 2 degrees
 RANDOM_COLOR, RANDOM_ROUGHNESS = 0.25, 0.1  # from strand to strand
-_SOLID = {0.0: (0.80, 0.72, 0.58), 0.3: (0.50, 0.33, 0.17), 0.6: (0.19, 0.10, 0.05), 1.0: (0.02, 0.014, 0.01)}  # melanin -> colour
+_SOLID = {0.0: (0.85, 0.78, 0.65), 0.3: (0.62, 0.44, 0.26), 0.6: (0.36, 0.21, 0.12), 1.0: (0.04, 0.03, 0.025)}  # melanin -> colour
 
 
 def hair_material(melanin: float = MELANIN[DEFAULT_COLOR], redness: float = 0.1, model: str = "CHIANG", name: str = NAME) -> bpy.types.Material:

@@ -127,7 +127,7 @@ def _link(into: bpy.types.Collection, name: str, data) -> bpy.types.Object:
 
 def _turntable(into, hair, units_per_mm) -> bpy.types.Object:
     turntable = _link(into, "Turntable", None)
-    turntable.empty_display_type, turntable.empty_display_size = "CIRCLE", 0.02
+    turntable.empty_display_type, turntable.empty_display_size = "SINGLE_ARROW", 0.02
     turntable.scale = (units_per_mm / METRES_PER_MM,) * 3
     hair.parent = turntable
     return turntable

@@ -110,8 +110,8 @@ def blend(strands_path: Path, out_blend: Path, capture: Capture | None = None) -
     rig = rig_scene.build(scene, hair, view)
     rig_scene.animate(scene, rig)
     scene.render.hair_type = "STRIP"
+    rig.board.hide_set(True)  # in the viewport; it would cover the hair from behind
     bpy.context.view_layer.objects.active = hair
-    hair.select_set(True)
     _look_at(strands)
     with atomic(out_blend) as part:
         try:

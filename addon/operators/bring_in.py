@@ -13,7 +13,7 @@ from .. import hair, material
 
 
 def show_strands(context, strands: Strands, name: str) -> bpy.types.Object:
-    """Strands as a new hair object with its material, active and selected."""
+    """Strands as a new hair object with its material, active and selected, and in view."""
     new = hair.add_hair(strands, name, context.collection)
     new.data.materials.append(bpy.data.materials.get(material.NAME) or material.hair_material())
     if context.object and context.object.mode != "OBJECT":
@@ -22,7 +22,18 @@ def show_strands(context, strands: Strands, name: str) -> bpy.types.Object:
         other.select_set(False)
     new.select_set(True)
     context.view_layer.objects.active = new
+    _frame_selected(context)
     return new
+
+
+def _frame_selected(context) -> None:
+    """Bring what is selected into view in the viewport: hair in real size is small. Nothing happens without a window."""
+    for area in context.screen.areas if context.screen and not bpy.app.background else ():
+        region = next((region for region in area.regions if region.type == "WINDOW"), None)
+        if area.type == "VIEW_3D" and region:
+            with context.temp_override(area=area, region=region):
+                bpy.ops.view3d.view_selected()
+            return
 
 
 class STRANDSCOPE_OT_import_capture(bpy.types.Operator, ImportHelper):
