@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import get_num_threads, njit, prange
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import gaussian_filter
 
 from .capture import Sweep
 from .errors import StrandscopeError
@@ -122,26 +122,26 @@ def blueness(planes: np.ndarray, params: HullParams | None = None) -> np.ndarray
 
 
 @njit(cache=True, nogil=True)
-def _blueness(planes, block, dark, out):  # bound by reading planes
+def _blueness(planes, block, dark, out):  # bound by reading planes: rows are added up first, which vectorises
     _, rows, cols = planes.shape
-    sums = np.empty((3, out.shape[1]), np.float32)
+    lines = np.empty((3, cols), np.float32)
     for i in range(out.shape[0]):
-        sums[:] = 0.0
         last = min((i + 1) * block, rows)
         for c in range(3):
-            for row in range(i * block, last):
-                line = planes[c, row]
-                for j in range(out.shape[1]):
-                    part = line[j * block : min((j + 1) * block, cols)]
-                    total = np.float32(0.0)
-                    for x in part:
-                        total += x
-                    sums[c, j] += total
+            lines[c] = planes[c, i * block]
+            for row in range(i * block + 1, last):
+                lines[c] += planes[c, row]
         for j in range(out.shape[1]):
-            pixels = (last - i * block) * (min((j + 1) * block, cols) - j * block)
-            red, green, blue = max(sums[0, j], 0.0), max(sums[1, j], 0.0), max(sums[2, j], 0.0)
+            end = min((j + 1) * block, cols)
+            red, green, blue = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            for col in range(j * block, end):
+                red += lines[0, col]
+                green += lines[1, col]
+                blue += lines[2, col]
+            pixels = (last - i * block) * (end - j * block)
+            red, green, blue = max(red, np.float32(0.0)), max(green, np.float32(0.0)), max(blue, np.float32(0.0))
             share = blue / (red + green + blue + dark * pixels)
-            out[i, j] = np.uint8(min(max(share * _BLUENESS_STEPS + 0.5, 0.0), 255.0))
+            out[i, j] = np.uint8(min(share * _BLUENESS_STEPS + 0.5, _BLUENESS_STEPS)) if share > 0 else np.uint8(0)
 
 
 # ---- visual hull -----------------------------------------------------------------------------------------------------
@@ -380,8 +380,30 @@ def hull_inside(max_blueness: np.ndarray, grid: Grid, params: HullParams | None 
     threshold = empty_blueness(max_blueness, params) if params.empty_blueness is None else params.empty_blueness
     inside = max_blueness < threshold  # NaN, never in focus, is not inside
     if params.thicken_mm > 0 and inside.any():
-        inside = distance_transform_edt(~inside, sampling=grid.voxel_mm) <= params.thicken_mm + 1e-6
+        inside = _thickened(inside, _ball(params.thicken_mm / grid.voxel_mm))
     return inside & np.isfinite(max_blueness)
+
+
+def _ball(radius: float) -> np.ndarray:
+    """Steps (n, 3) to all cells whose centres are at most radius cells away."""
+    reach = np.arange(-int(radius + 1), int(radius + 1) + 1)
+    steps = np.stack(np.meshgrid(reach, reach, reach, indexing="ij"), axis=-1).reshape(-1, 3)
+    return steps[np.sum(steps**2, axis=1) <= (radius + 1e-6) ** 2]
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _thickened(inside, steps):
+    nx, ny, nz = inside.shape
+    out = inside.copy()
+    for i in prange(nx):
+        for j in range(ny):
+            for k in range(nz):
+                for n in range(len(steps)):
+                    if out[i, j, k]:
+                        break
+                    a, b, c = i + steps[n, 0], j + steps[n, 1], k + steps[n, 2]
+                    out[i, j, k] = 0 <= a < nx and 0 <= b < ny and 0 <= c < nz and inside[a, b, c]
+    return out
 
 
 def carved_inside(ray_count: np.ndarray, hull: np.ndarray, grid: Grid, params: HullParams | None = None) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
-from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.ndimage import find_objects, gaussian_filter, maximum_filter
 from scipy.sparse import csr_array, diags_array, eye_array, kron
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
@@ -185,7 +185,9 @@ def direction_field(
     if occupancy is not None:
         near |= grid.check(occupancy, "the occupancy") > 0.0
     kinds[maximum_filter(near, 2 * int(np.ceil(params.margin_mm / grid.voxel_mm)) + 1) == 0] = OUTSIDE
-    return laplace_fill(field, kinds, params.cycles, params.tolerance)
+    box = find_objects((kinds != OUTSIDE).view(np.int8))[0]
+    field[box] = laplace_fill(field[box], kinds[box], params.cycles, params.tolerance)
+    return field
 
 
 def _main_directions(index, count, tangents, lengths):
@@ -315,15 +317,20 @@ def _relax_few(u, wanted, given, kinds, sweeps):
 
 @njit(cache=True, nogil=True)
 def _relax_slice(u, wanted, given, kinds, colour, i):
-    _, ny, nz, parts = u.shape
+    nx, ny, nz, parts = u.shape
+    rows = _beside(i, nx)
     for j in range(ny):
+        cols = _beside(j, ny)
         for k in range((i + j + colour) % 2, nz, 2):
             if kinds[i, j, k] != UNKNOWN:
                 continue
+            deep = _beside(k, nz)
+            weights, count = _weights(kinds, i, j, k, rows, cols, deep)
+            if count == 0:
+                continue
             for c in range(parts):
-                total, count = _around(u, kinds, i, j, k, c)
-                if count > 0:
-                    u[i, j, k, c] = (total - (wanted[i, j, k, c] if given else np.float32(0.0))) / count
+                total = _around(u, weights, i, j, k, rows, cols, deep, c)
+                u[i, j, k, c] = (total - (wanted[i, j, k, c] if given else np.float32(0.0))) / count
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -331,12 +338,16 @@ def _defect(u, wanted, given, kinds, out):
     nx, ny, nz, parts = u.shape
     largest = np.zeros(nx, np.float32)
     for i in prange(nx):
+        rows = _beside(i, nx)
         for j in range(ny):
+            cols = _beside(j, ny)
             for k in range(nz):
                 if kinds[i, j, k] != UNKNOWN:
                     continue
+                deep = _beside(k, nz)
+                weights, count = _weights(kinds, i, j, k, rows, cols, deep)
                 for c in range(parts):
-                    total, count = _around(u, kinds, i, j, k, c)
+                    total = _around(u, weights, i, j, k, rows, cols, deep, c)
                     defect = (wanted[i, j, k, c] if given else np.float32(0.0)) - (total - count * u[i, j, k, c])
                     out[i, j, k, c] = defect
                     if count > 0:
@@ -344,30 +355,31 @@ def _defect(u, wanted, given, kinds, out):
     return largest
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _around(u, kinds, i, j, k, c):
-    """Sum of the neighbours that take part, and their number."""
-    nx, ny, nz = kinds.shape
-    total, count = np.float32(0.0), np.float32(0.0)
-    if i > 0 and kinds[i - 1, j, k] != OUTSIDE:
-        total += u[i - 1, j, k, c]
-        count += np.float32(1.0)
-    if i + 1 < nx and kinds[i + 1, j, k] != OUTSIDE:
-        total += u[i + 1, j, k, c]
-        count += np.float32(1.0)
-    if j > 0 and kinds[i, j - 1, k] != OUTSIDE:
-        total += u[i, j - 1, k, c]
-        count += np.float32(1.0)
-    if j + 1 < ny and kinds[i, j + 1, k] != OUTSIDE:
-        total += u[i, j + 1, k, c]
-        count += np.float32(1.0)
-    if k > 0 and kinds[i, j, k - 1] != OUTSIDE:
-        total += u[i, j, k - 1, c]
-        count += np.float32(1.0)
-    if k + 1 < nz and kinds[i, j, k + 1] != OUTSIDE:
-        total += u[i, j, k + 1, c]
-        count += np.float32(1.0)
-    return total, count
+@njit(cache=True, nogil=True)
+def _beside(i, size):
+    """The indices before and after i; at the border i itself."""
+    return max(i - 1, 0), min(i + 1, size - 1)
+
+
+@njit(cache=True, nogil=True)
+def _weights(kinds, i, j, k, rows, cols, deep):
+    """1 for each of the six neighbours that takes part and 0 for the others, and their number."""
+    one, none = np.float32(1.0), np.float32(0.0)
+    a = one if rows[0] != i and kinds[rows[0], j, k] != OUTSIDE else none
+    b = one if rows[1] != i and kinds[rows[1], j, k] != OUTSIDE else none
+    c = one if cols[0] != j and kinds[i, cols[0], k] != OUTSIDE else none
+    d = one if cols[1] != j and kinds[i, cols[1], k] != OUTSIDE else none
+    e = one if deep[0] != k and kinds[i, j, deep[0]] != OUTSIDE else none
+    f = one if deep[1] != k and kinds[i, j, deep[1]] != OUTSIDE else none
+    return (a, b, c, d, e, f), a + b + c + d + e + f
+
+
+@njit(cache=True, nogil=True)
+def _around(u, weights, i, j, k, rows, cols, deep, c):
+    """Sum of the neighbours that take part."""
+    along_x = weights[0] * u[rows[0], j, k, c] + weights[1] * u[rows[1], j, k, c]
+    along_y = weights[2] * u[i, cols[0], k, c] + weights[3] * u[i, cols[1], k, c]
+    return along_x + along_y + weights[4] * u[i, j, deep[0], c] + weights[5] * u[i, j, deep[1], c]
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -565,7 +577,7 @@ def _follow(x, y, z, heading, field, density, step, most_steps, points, at, stri
     return most_steps, total
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _corner(x, size):
     """The two cells whose centres lie around x, and the share of the second; beyond the outer centres the outer cell."""
     low = min(max(int(np.floor(x - 0.5)), 0), size - 1)
