@@ -77,6 +77,7 @@ class Job:
         if not ended:
             return None
         self._process.stdin.close()
+        self._process.stdout.close()
         if self._stop_at is not None:
             return Result()
         if self._process.returncode == 0 and self._output:
@@ -110,7 +111,7 @@ class Job:
             self._process.stdin.close()  # Windows has no polite request; the child watches this
 
     def _read(self) -> None:
-        with open(self.command.log, "ab") as log:
+        with open(self.command.log, "ab", buffering=0) as log:
             for line in self._process.stdout:
                 event = _event(line)
                 if event is None:

@@ -20,7 +20,7 @@ def hair_material(melanin: float = MELANIN[DEFAULT_COLOR], redness: float = 0.1,
     nodes.clear()
     output, hair, info = (nodes.new(f"ShaderNode{kind}") for kind in ("OutputMaterial", "BsdfHairPrincipled", "HairInfo"))
     output.location, info.location = (320, 0), (-240, -120)
-    hair.model, hair.parametrization = model, "MELANIN"
+    hair.parametrization = "MELANIN"
     for socket, value in {
         "Melanin": melanin,
         "Melanin Redness": redness,
@@ -32,6 +32,7 @@ def hair_material(melanin: float = MELANIN[DEFAULT_COLOR], redness: float = 0.1,
         "Random Roughness": RANDOM_ROUGHNESS,
     }.items():
         hair.inputs[socket].default_value = value
+    hair.model = model  # only now: a socket that a model does not use cannot be found by its name
     links.new(info.outputs["Random"], hair.inputs["Random"])
     links.new(hair.outputs["BSDF"], output.inputs["Surface"])
     material.diffuse_color = (*solid_color(melanin), 1.0)

@@ -9,11 +9,13 @@ import argparse
 import fnmatch
 import hashlib
 import importlib.metadata
+import os
 import platform
 import re
 import shutil
 import subprocess
 import sys
+import tempfile
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,7 +69,7 @@ def main() -> None:
 
 
 def build(name: str, dist: Path, without_wheels: bool) -> None:
-    """Stage what ships, with the wheels of a platform, let Blender's own tool pack it, and have it validated."""
+    """Stage what ships, with the wheels of a platform, let Blender's own tool pack and validate it, and try it out here."""
     version = manifest()["version"]
     stage = BUILD / "extension" / (name + "-without-wheels" * without_wheels)
     shutil.rmtree(stage, ignore_errors=True)
@@ -90,6 +92,15 @@ def build(name: str, dist: Path, without_wheels: bool) -> None:
     step(f"Packing {out.name} …", *tool, "build", tags, "--source-dir", stage, "--output-filepath", out, quiet=True)
     step("Asking Blender's validator …", *tool, "validate", tags, out, quiet=True)
     shutil.rmtree(stage)
+    if name == HERE[platform.system()]:
+        with tempfile.TemporaryDirectory() as resources:
+            environment = os.environ | {"BLENDER_USER_RESOURCES": resources}
+            check = [sys.executable, ROOT / "scripts" / "check_extension.py", out]
+            print("Installing, enabling, disabling, enabling it in Blender …", end=" ", flush=True)
+            result = subprocess.run(check, env=environment, check=False, capture_output=True, text=True, encoding="utf-8", errors="replace")
+        print("failed" if result.returncode else "ok", flush=True)
+        if result.returncode:
+            sys.exit(result.stdout + result.stderr)
     print(f"{out} ({out.stat().st_size / 1e6:.0f} MB, {len({wheel.name for wheel in wheels})} wheels)", flush=True)
 
 
