@@ -24,7 +24,7 @@ from ..core.files import explain
 from .props import ROOT
 
 WORKER = Path(__file__).resolve().parent.parent / "worker.py"
-STOP_S = 1.5  # from the polite request to end to the other kind
+STOP_S = 1.0  # from the polite request to end to the other kind
 TICK_S = 0.1
 
 

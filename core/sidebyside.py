@@ -74,12 +74,14 @@ def write_pairs(pairs: list[tuple[np.ndarray, np.ndarray]], captions: list[tuple
     rows = -(-len(pairs) // across)
     cell_w, cell_h = 2 * (width + GAP_PX) + 3 * GAP_PX, height + CAPTION_PX + GAP_PX
     picture = Image.new("RGB", (across * cell_w - 4 * GAP_PX, rows * cell_h), PAPER)
-    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
+    font = ImageFont.load_default(13)
     for i, (pair, texts) in enumerate(zip(pairs, captions, strict=True)):
         for k, (pixels, text) in enumerate(zip(pair, texts, strict=True)):
             x, y = (i % across) * cell_w + k * (width + GAP_PX), (i // across) * cell_h
             picture.paste(Image.fromarray(pixels), (x, y))
-            pen.text((x + 5, y + height + 4), text, fill=INK, font=font)
+            caption = Image.new("RGB", (width, CAPTION_PX), PAPER)  # cut off where a picture is narrow
+            ImageDraw.Draw(caption).text((5, 4), text, fill=INK, font=font)
+            picture.paste(caption, (x, y + height))
     with atomic(out) as part:
         picture.save(part)
 

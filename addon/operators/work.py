@@ -108,6 +108,9 @@ class STRANDSCOPE_OT_open_comparison(bpy.types.Operator):
         area = context.window_manager.windows[-1].screen.areas[0]
         area.type = "IMAGE_EDITOR"
         area.spaces.active.image = image
+        region = next(region for region in area.regions if region.type == "WINDOW")
+        with context.temp_override(window=context.window_manager.windows[-1], area=area, region=region):
+            bpy.ops.image.view_all(fit_view=True)
         return {"FINISHED"}
 
 
