@@ -58,7 +58,8 @@ class Job:
         group = {"start_new_session": True} if os.name == "posix" else {"creationflags": subprocess.CREATE_NO_WINDOW}
         try:
             command.log.parent.mkdir(parents=True, exist_ok=True)
-            with open(command.log, "wb") as log:
+            command.log.write_bytes(b"")
+            with open(command.log, "ab") as log:  # appended to by the child and by the reader
                 self._process = subprocess.Popen(
                     argv or child_argv(command), env=child_environment(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, **group
                 )
