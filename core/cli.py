@@ -205,7 +205,7 @@ def simulate(session, out, style, scale, fibers, seed):
     """Photograph hair that is known: make a capture in the folder OUT from simulated fibers.
 
     Leaves raw photographs (DNG), capture.json, and truth.npz, which says where every hair really is, so that a
-    reconstruction can be scored.
+    reconstruction can be scored. A run that was interrupted goes on where it stopped, and one that is complete is kept.
 
     \b
     Example:
@@ -213,8 +213,7 @@ def simulate(session, out, style, scale, fibers, seed):
     """
     from . import simulate as simulator
 
-    choices = {"style": style, "seed": seed} | ({"fibers": fibers} if fibers else {})
-    simulator.simulate(out, replace(simulator.SCALES[scale], **choices), session.report)
+    simulator.simulate(out, simulator.SimulateParams(style=style, scale=scale, fibers=fibers, seed=seed), session.report)
     session.report.done(out)
 
 
@@ -332,11 +331,19 @@ def import_(
     help="The paper's settings for a kind of hair; auto estimates them from the photographs.",
 )
 @click.option("--params", type=PATH, help="A TOML file with settings, in place of a preset.")
-@click.option("--method", type=click.Choice(["paper"]), default="paper", show_default=True, help="The way of reconstruction.")
+@click.option(
+    "--method",
+    type=click.Choice(["strandscope", "paper"]),
+    default="strandscope",
+    show_default=True,
+    help="The paper's own filter and growing, or ours, which finds more.",
+)
 @click.option("--infill", type=click.IntRange(0), metavar="N", help="Number of hairs to add inside, where no camera sees.")
 @click.option("--no-infill", is_flag=True, help="Captured hairs only.")
 @click.option("--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given.")
-@click.option("--memory", type=Memory(), default="6GB", show_default=True, help="Memory to use at most.")
+@click.option(
+    "--memory", type=Memory(), default="6GB", show_default=True, help="Memory to use at most; a capture that needs more is refused in words."
+)
 @common
 @click.pass_obj
 def reconstruct(session, capture, output, preset, params, method, infill, no_infill, workers, memory):
@@ -353,11 +360,12 @@ def reconstruct(session, capture, output, preset, params, method, infill, no_inf
         raise click.UsageError("--infill and --no-infill exclude each other")
     from . import pipeline
 
-    parameters = pipeline.read_toml(params) if params else pipeline.preset(preset)
-    changes = {"method": method, "memory_bytes": memory}
-    if no_infill or infill is not None:
-        changes["infill"] = infill or 0
-    pipeline.reconstruct(capture, output, replace(parameters, **changes), workers=workers, progress=session.report)
+    parameters = pipeline.read_toml(params) if params else pipeline.preset(preset, method)
+    if no_infill:
+        parameters = replace(parameters, infill=None)
+    elif infill is not None:
+        parameters = replace(parameters, infill=replace(parameters.infill, count=infill))
+    pipeline.reconstruct(capture, output, parameters, workers=workers, memory_bytes=memory, progress=session.report)
     session.report.done(output)
 
 

@@ -21,6 +21,7 @@ class Strands:
     radius_mm: np.ndarray  # (N,) float32
     kind: np.ndarray  # (M,) uint8: CAPTURED or INFILL
     confidence: np.ndarray  # (N,) float32, 0 to 1
+    stops: np.ndarray | None = None  # (M, 2) uint8: why either end of a curve stopped growing (``grow.Stop``), 0 unknown
     provenance: dict = field(default_factory=dict)  # capture's name, parameters, version
 
     def __len__(self) -> int:
@@ -41,6 +42,7 @@ class Strands:
             radius_mm=self.radius_mm[points],
             kind=self.kind[keep],
             confidence=self.confidence[points],
+            stops=None if self.stops is None else self.stops[keep],
         )
 
     @property
@@ -117,6 +119,7 @@ def concatenate(parts: list[Strands], provenance: dict) -> Strands:
         radius_mm=np.concatenate([p.radius_mm for p in parts]),
         kind=np.concatenate([p.kind for p in parts]),
         confidence=np.concatenate([p.confidence for p in parts]),
+        stops=np.concatenate([np.zeros((len(p), 2), np.uint8) if p.stops is None else p.stops for p in parts]),
         provenance=provenance,
     )
 
@@ -130,6 +133,7 @@ def save_strands(path: Path, strands: Strands) -> None:
         "radius": strands.radius_mm.astype(np.float32),
         "kind": strands.kind.astype(np.uint8),
         "confidence": strands.confidence.astype(np.float32),
+        "stops": np.zeros((len(strands), 2), np.uint8) if strands.stops is None else strands.stops.astype(np.uint8),
         "provenance": np.array(json.dumps(strands.provenance, sort_keys=True)),
     }
     with atomic(path) as part:
@@ -152,6 +156,7 @@ def load_strands(path: Path) -> Strands:
         radius_mm=arrays.get("radius", np.full(count, 0.04, np.float32)),
         kind=arrays.get("kind", np.zeros(sizes, np.uint8)),
         confidence=arrays.get("confidence", np.ones(count, np.float32)),
+        stops=arrays.get("stops"),
         provenance=provenance,
     )
     check(strands, path)
@@ -184,11 +189,15 @@ def check(strands: Strands, path: Path) -> None:
     for name, values in (("radius", strands.radius_mm), ("confidence", strands.confidence)):
         _expect(values.shape == (len(points),), path, name, values.shape, f"one value a point ({len(points)},)")
     _expect(strands.kind.shape == (len(strands),), path, "kind", strands.kind.shape, f"one value a curve ({len(strands)},)")
+    if strands.stops is not None:
+        _expect(strands.stops.shape == (len(strands), 2), path, "stops", strands.stops.shape, f"two values a curve ({len(strands)}, 2)")
     for name, values in (("points", points), ("radius", strands.radius_mm), ("confidence", strands.confidence)):
         bad = np.argwhere(~np.isfinite(values))
         if len(bad):
             raise StrandsError(f"{path}: {name}{bad[0].tolist()} is {values[tuple(bad[0])]}; expected finite numbers ({len(bad)} are not)")
     _expect(bool(np.all(strands.radius_mm > 0)), path, "radius", "0 or less", "more than 0 mm")
+    confidence = strands.confidence
+    _expect(bool(np.all((confidence >= 0) & (confidence <= 1))), path, "confidence", "outside its range", "0 to 1")
     _expect(bool(np.all(strands.kind <= INFILL)), path, "kind", int(strands.kind.max(initial=0)), "0 (captured) or 1 (infill)")
 
 

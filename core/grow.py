@@ -1,0 +1,690 @@
+"""Growing fibers through the observations of all sweeps (sec. 4.2, Figure 7).
+
+A fiber lies where the ribbons of several sweeps meet. From a seed the grower steps along it in both directions: each camera
+says how the hair is turned in its image (``find_orientations``), the direction that fits all of them best is taken
+(``solve_direction``), a step is made, and the new point is drawn back to where the ribbons meet (``solve_correction``).
+
+Departures from the paper, all off in ``PAPER``:
+* Observations are weighted: less the farther they are from the ribbon's middle, the farther from the expected angle and the
+  farther from the plane of focus. In a dense lock the box of a hair holds its neighbours as well.
+* A camera's orientation joins the angles of its features and the slope of their positions along the hair.
+* A camera speaks only when enough of its rows see the hair.
+
+Seeds are grown in batches that do not depend on the number of threads: every seed of a batch grows on the observations that
+earlier batches left, then the curves are accepted in a fixed order, longest first, unless most of what they stand on was
+taken by one before. The result is the same for any number of threads.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from .features import (
+    ANGLE_STEPS,
+    BLOCK_PX,
+    STRIP_PX,
+    Index,
+    cell_range,
+    frames_between,
+    image_of,
+    run_of,
+)
+from .geometry import project, slope, to_image, to_pixel, turn, turn_back
+from .progress import Progress, silent
+
+_turn, _turn_back, _slope, _to_pixel, _to_image, _project = (
+    njit(turn), njit(turn_back), njit(slope), njit(to_pixel), njit(to_image), njit(project),
+)  # fmt: skip
+BATCH = 256  # seeds grown against the same observations; part of the result, not of the machine
+MAX_HITS = 2048  # features of one camera that one step looks at
+
+
+class Stop(IntEnum):
+    """Why growing ended at one end of a curve."""
+
+    LEFT_VOLUME = 1  # fewer than three cameras have the point in their field
+    UNOBSERVED = 2  # fewer than three cameras saw the hair, longer than can be bridged
+    TOO_LONG = 3  # the curve reached the longest length allowed
+
+
+@dataclass(frozen=True)
+class GrowParams:
+    """Section 4.2 and Table 1; pixels are those of the channel plane."""
+
+    step_mm: float = 0.1  # h
+    cone_deg: float = 1.5  # omega: largest turn in one step
+    max_correction_px: float = 0.5  # gamma: largest correction in one step
+    box_px: tuple[float, float, float] = (40.0, 30.0, 8.0)  # a_g, a_s, a_t: full extents along the hair, the slope, across
+    near_focus_mm: float = 0.3  # a_s of find_orientations: full extent
+    min_cameras: int = 3  # m: cameras that a step needs
+    bridge_mm: float = 1.0  # how far a hair is continued straight where it is not observed
+    min_seed_cameras: int = 4  # angles that a seed cell must have recorded
+    seed_cell_mm: float = 0.2
+    min_length_mm: float = 2.0  # shorter curves are taken for chance
+    max_length_mm: float = 400.0
+    weighted: bool = True  # False: every observation in the box counts the same, as in the paper
+    sigma_px: float = 0.6  # weight across the ribbon
+    agree_px: float = 1.0  # a camera whose ribbon passes farther from where the others meet is not heard
+    claim_px: float = 1.0  # observations this near to a curve are used up by it
+    sigma_deg: float = 6.0  # weight by angle; 2.2 of it is the gate
+    sigma_focus_mm: float = 0.3  # weight by distance from the plane of focus
+    min_support: float = 0.25  # a camera speaks when it has this share of the observations of a hair in full view
+    radius_mm: float = 0.04
+
+
+# The paper's own way, its unstated bounds as near as its words allow.
+PAPER = GrowParams(weighted=False, near_focus_mm=0.1, bridge_mm=0.5, min_length_mm=5.0)
+
+
+@dataclass(frozen=True)
+class Grown:
+    """M captured curves of N points, flat."""
+
+    points_mm: np.ndarray  # (N, 3) float32
+    offsets: np.ndarray  # (M + 1,) int64
+    cameras: np.ndarray  # (N,) uint8: how many spoke at the point
+    stops: np.ndarray  # (M, 2) uint8: Stop of either end
+    tried: int  # seeds looked at
+
+
+class _Box(NamedTuple):
+    """GrowParams in mm and radians, as the kernels take it."""
+
+    step: float
+    cone_cos: float
+    cone_sin: float
+    gamma: float
+    half: tuple[float, float, float]
+    near_focus: float
+    min_cameras: int
+    bridge: int
+    max_points: int
+    weighted: bool
+    sigma: float
+    agree: float
+    claim: float
+    sigma_angle: float
+    sigma_focus: float
+    min_support: float
+    min_seed_cameras: int
+
+
+def _box(params: GrowParams, index: Index) -> _Box:
+    pitch_mm, cone = index.pitch, np.radians(params.cone_deg)
+    frame_mm = np.median(np.abs(np.diff(index.positions)))
+    # rows times frames of a hair upright in the image; 0.8 is the mean of the other two weights on a true hair
+    full_support = 0.8 * params.box_px[0] * np.sqrt(2 * np.pi) * params.sigma_focus_mm / frame_mm
+    return _Box(
+        step=params.step_mm,
+        cone_cos=float(np.cos(cone)),
+        cone_sin=float(np.sin(cone)),
+        gamma=params.max_correction_px * pitch_mm,
+        half=tuple(0.5 * px * pitch_mm for px in params.box_px),
+        near_focus=0.5 * params.near_focus_mm,
+        min_cameras=params.min_cameras,
+        bridge=round(params.bridge_mm / params.step_mm),
+        max_points=int(0.5 * params.max_length_mm / params.step_mm),
+        weighted=params.weighted,
+        sigma=params.sigma_px * pitch_mm,
+        agree=params.agree_px * pitch_mm,
+        claim=params.claim_px * pitch_mm,
+        sigma_angle=float(np.radians(params.sigma_deg)),
+        sigma_focus=params.sigma_focus_mm,
+        min_support=params.min_support * full_support if params.weighted else 1.0,
+        min_seed_cameras=params.min_seed_cameras,
+    )
+
+
+# ---- one camera's view of a point of a hair --------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _sees(index, k, u, v, w):
+    """Whether the point (u', v', w) of camera k's frame comes into focus inside its photographs."""
+    positions = index.positions[index.first_position[k] : index.first_position[k + 1]]
+    col, row = _to_pixel(u, v, index.pitch, index.axis_col, index.axis_row)
+    return positions[0] <= w <= positions[-1] and 0 <= col <= index.columns - 1 and 0 <= row <= index.rows - 1
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _hair_frame(index, k, p, g):
+    """Camera k's frame of a hair at p (3,) along g (3,): the point, g, s and t as rows of (4, 3), and the angle of the hair
+    in the image. s is the slope of the ribbon made perpendicular to g, t the normal of the ribbon (sec. 4.2)."""
+    frame = np.empty((4, 3))
+    frame[0] = _turn(p[0], p[1], p[2], index.cos[k], index.sin[k])
+    frame[1] = _turn(g[0], g[1], g[2], index.cos[k], index.sin[k])
+    sx, sy, sz = _slope(frame[0, 0], frame[0, 1], index.distance)
+    along = sx * frame[1, 0] + sy * frame[1, 1] + sz * frame[1, 2]
+    sx, sy, sz = sx - along * frame[1, 0], sy - along * frame[1, 1], sz - along * frame[1, 2]
+    size = np.sqrt(sx * sx + sy * sy + sz * sz)
+    frame[2] = sx / size, sy / size, sz / size
+    frame[3] = np.cross(frame[1], frame[2])
+    # how the image of the point moves as it slides along the hair, at focus: d(u, v) = (g_u + u/l g_w, g_v + v/l g_w)
+    du = frame[1, 0] + frame[0, 0] / index.distance * frame[1, 2]
+    dv = frame[1, 1] + frame[0, 1] / index.distance * frame[1, 2]
+    return frame, np.arctan2(dv, du), np.hypot(du, dv)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _gather(index, k, frame, angle, box, hits):
+    """Observations of camera k in the box of a hair; hits (n, 5) receives along, slope, across (mm), turn (rad) and weight 1.
+
+    Bound by cache misses: a few dozen runs of 8-byte features.
+    """
+    half = box.half
+    reach = np.abs(frame[1]) * half[0] + np.abs(frame[2]) * half[1] + np.abs(frame[3]) * half[2]
+    first_frame, last_frame = frames_between(index, k, frame[0, 2] - reach[2], frame[0, 2] + reach[2])
+    s0, s1, b0, b1 = cell_range(index, frame[0, 0], frame[0, 1], reach[0], reach[1])
+    gate = 2.2 * box.sigma_angle
+    count = 0
+    for strip in range(s0, s1):
+        for block in range(b0, b1):
+            start, stop = run_of(index, k, strip, block, first_frame, last_frame)
+            for i in range(start, stop):
+                u, v = image_of(index, i, strip, block)
+                x, y = u - frame[0, 0], v - frame[0, 1]
+                z = index.positions[index.first_position[k] + index.frame[i]] - frame[0, 2]
+                across = frame[3, 0] * x + frame[3, 1] * y + frame[3, 2] * z
+                if abs(across) > half[2] or index.strength[i] == 0:
+                    continue
+                along = frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z
+                depth = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z
+                if abs(along) > half[0] or abs(depth) > half[1]:
+                    continue
+                off = index.angle[i] * (np.pi / ANGLE_STEPS) - angle
+                off -= np.pi * np.round(off / np.pi)
+                if box.weighted and abs(off) > gate:
+                    continue
+                if count == len(hits):
+                    return count
+                hits[count] = along, depth, across, off, 1.0
+                count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _speak(hits, count, box, centre):
+    """What a camera says of a hair, from its observations: (support, offset across in mm, turn in the image in rad).
+
+    centre: where across the ribbon the hair is expected. The paper's mean, or a weighted mean with a line fitted along the
+    hair; the turn joins the angles of the features and the slope of that line by how well each is known.
+    """
+    w = wa = waa = we = wae = wo = near = 0.0
+    for i in range(count):
+        along, depth, across, off = hits[i, 0], hits[i, 1], hits[i, 2], hits[i, 3]
+        weight = 1.0
+        if box.weighted:  # biweights of the width of Gaussians of these sigmas: no exp, and nothing from far away
+            x, y, z = (across - centre) / box.sigma, off / box.sigma_angle, depth / box.sigma_focus
+            x, y, z = max(1 - 0.207 * x * x, 0.0), max(1 - 0.207 * y * y, 0.0), max(1 - 0.207 * z * z, 0.0)
+            weight = x * x * y * y * z * z
+        w += weight
+        we += weight * across
+        if box.weighted or abs(depth) <= box.near_focus:
+            near += weight
+            wo += weight * off
+        wa += weight * along
+        waa += weight * along * along
+        wae += weight * along * across
+    if w < 1e-9:
+        return 0.0, 0.0, 0.0, False
+    offset = we / w
+    if not box.weighted:
+        return w, offset, wo / near if near else 0.0, near > 0
+    spread = waa - wa * wa / w
+    lean = (wae - wa * we / w) / spread if spread > 1e-12 else 0.0
+    # per observation: 0.22 px across, 2.5 degrees of angle
+    known_angle, known_lean = w / 0.0436**2, spread / (0.22 / 0.5 * 0.5 * box.sigma) ** 2
+    turned = wo / w
+    # s looks at the camera and t = g x s, so a hair that turns counterclockwise in the image leans away from t
+    joined = (known_angle * turned - known_lean * np.arctan(lean)) / (known_angle + known_lean)
+    return w, offset - lean * wa / w, joined, True
+
+
+class _View(NamedTuple):
+    """What the cameras say of a point: arrays over the sweeps, and how many spoke."""
+
+    weight: np.ndarray  # (S,)
+    offset: np.ndarray  # (S,) across the ribbon, mm
+    across: np.ndarray  # (S, 3) t of each ribbon, object frame
+    normal: np.ndarray  # (S, 3) n of the plane of camera and hair, object frame
+    turned: np.ndarray  # (S,) bool: whether the camera gave an orientation
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _look(index, p, g, box, hits, view):
+    """Ask every camera about a hair at p along g; fills view. Returns (cameras that spoke, cameras that could)."""
+    spoke = could = 0
+    for k in range(len(index.cos)):
+        view.weight[k] = 0.0
+        view.turned[k] = False
+        frame, angle, size = _hair_frame(index, k, p, g)
+        if not _sees(index, k, frame[0, 0], frame[0, 1], frame[0, 2]):
+            continue
+        could += 1
+        if size < 0.2:  # the hair points at the camera
+            continue
+        count = _gather(index, k, frame, angle, box, hits)
+        if count == 0:
+            continue
+        support, offset, turn_by, turned = _speak(hits, count, box, 0.0)
+        if box.weighted and support > 0:
+            support, offset, turn_by, turned = _speak(hits, count, box, offset)
+        if support < box.min_support:
+            continue
+        spoke += 1
+        view.weight[k] = support
+        view.offset[k] = offset
+        view.across[k] = _turn_back(frame[3, 0], frame[3, 1], frame[3, 2], index.cos[k], index.sin[k])
+        # n: the plane through the camera and the line of this orientation in the image
+        sx, sy, sz = _slope(frame[0, 0], frame[0, 1], index.distance)
+        ou, ov = np.cos(angle + turn_by), np.sin(angle + turn_by)
+        nx, ny, nz = ov * sz, -ou * sz, ou * sy - ov * sx
+        norm = np.sqrt(nx * nx + ny * ny + nz * nz)
+        view.normal[k] = _turn_back(nx / norm, ny / norm, nz / norm, index.cos[k], index.sin[k])
+        view.turned[k] = turned
+    return spoke, could
+
+
+# ---- Figure 7 --------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def solve_direction(normals, weights, g):
+    """The unit direction (3,) with normals (S, 3) . direction = 0 in the least squares, nearest in sign to g.
+
+    The eigenvector of the smallest eigenvalue of sum w n n^T (the paper's last right singular vector), by inverse iteration.
+    """
+    m = np.zeros((3, 3))
+    for k in range(len(weights)):
+        if weights[k] > 0:
+            n = normals[k]
+            for a in range(3):
+                for b in range(3):
+                    m[a, b] += weights[k] * n[a] * n[b]
+    ridge = 1e-9 * (m[0, 0] + m[1, 1] + m[2, 2]) + 1e-30
+    for a in range(3):
+        m[a, a] += ridge
+    c0, c1, c2 = np.cross(m[1], m[2]), np.cross(m[2], m[0]), np.cross(m[0], m[1])  # columns of the adjugate
+    x = g.copy()
+    for _ in range(4):
+        x = c0 * x[0] + c1 * x[1] + c2 * x[2]
+        x /= np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+    return x if x[0] * g[0] + x[1] * g[1] + x[2] * g[2] > 0 else -x
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def solve_correction(across, offsets, weights, g):
+    """The offset (3,) perpendicular to g that brings the point to where the ribbons meet (eq. 3), in the least squares:
+    across (S, 3) . offset = offsets (S,). Each camera's sum over its observations enters as their mean with their number."""
+    xx = np.zeros((3, 3))
+    b = np.zeros(3)
+    total = 0.0
+    for k in range(len(weights)):
+        if weights[k] > 0:
+            t = across[k]
+            total += weights[k]
+            for i in range(3):
+                b[i] += weights[k] * t[i] * offsets[k]
+                for j in range(3):
+                    xx[i, j] += weights[k] * t[i] * t[j]
+    for i in range(3):  # g itself is not to be moved along; the ridge holds what no camera tells
+        for j in range(3):
+            xx[i, j] += total * g[i] * g[j]
+        xx[i, i] += 1e-3 * total
+    c0, c1, c2 = np.cross(xx[1], xx[2]), np.cross(xx[2], xx[0]), np.cross(xx[0], xx[1])
+    det = xx[0, 0] * c0[0] + xx[0, 1] * c0[1] + xx[0, 2] * c0[2]
+    q = (c0 * b[0] + c1 * b[1] + c2 * b[2]) / det
+    return q - g * (q[0] * g[0] + q[1] * g[1] + q[2] * g[2])
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _within_cone(new, old, box):
+    """``new`` turned back to the rim of the cone of omega around ``old`` where it lies outside (unit vectors)."""
+    c = new[0] * old[0] + new[1] * old[1] + new[2] * old[2]
+    if c >= box.cone_cos:
+        return new
+    side = new - c * old
+    size = np.sqrt(side[0] ** 2 + side[1] ** 2 + side[2] ** 2)
+    if size < 1e-12:
+        return old
+    return box.cone_cos * old + (box.cone_sin / size) * side
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _corrected(p, g, view, bound):
+    """p drawn to where the ribbons meet, by no more than bound (mm)."""
+    q = solve_correction(view.across, view.offset, view.weight, g)
+    size = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2)
+    if size > bound:
+        q *= bound / size
+    return p + q
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _listen(view, g, box):
+    """Weigh down the cameras whose ribbon passes the others' meeting point by: their number that agree. Starts at the
+    prediction, so that a crowd on a neighbouring hair does not win. ``view.weight`` is 0 for those that do not agree."""
+    agreeing = 0
+    q = np.zeros(3)
+    weights = np.empty_like(view.weight)
+    bound = box.agree * box.agree
+    for trial in range(3):
+        agreeing = 0
+        for k in range(len(weights)):
+            t = view.across[k]
+            off = view.offset[k] - (t[0] * q[0] + t[1] * q[1] + t[2] * q[2])
+            near = max(1 - off * off / bound, 0.0)
+            weights[k] = view.weight[k] * near * near
+            agreeing += weights[k] > 0
+        if trial < 2 and agreeing:
+            q = solve_correction(view.across, view.offset, weights, g)
+    view.weight[:] = weights
+    return agreeing
+
+
+@njit(cache=True, nogil=True)
+def _new_view(cameras):
+    return _View(np.zeros(cameras), np.zeros(cameras), np.zeros((cameras, 3)), np.zeros((cameras, 3)), np.zeros(cameras, np.bool_))
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _grow_end(index, p, g, box, hits, view, points, cameras):
+    """Grow from p along g; fills points (n, 3) and cameras (n,). Returns (points kept, Stop). The seed itself is not written."""
+    count = kept = unseen = 0
+    while count < min(box.max_points, len(points)):
+        p = p + box.step * g
+        spoke, could = _look(index, p, g, box, hits, view)
+        if could < box.min_cameras:
+            return kept, Stop.LEFT_VOLUME.value
+        if box.weighted:
+            spoke = _listen(view, g, box)
+        if spoke >= box.min_cameras:
+            p = _corrected(p, g, view, box.gamma)
+            directed = 0
+            for k in range(len(view.weight)):
+                directed += view.turned[k] and view.weight[k] > 0
+            if directed >= box.min_cameras:
+                g = _within_cone(solve_direction(view.normal, view.weight * view.turned, g), g, box)
+            unseen = 0
+        else:
+            unseen += 1
+            if unseen > box.bridge:
+                return kept, Stop.UNOBSERVED.value
+        points[count] = p
+        cameras[count] = spoke
+        count += 1
+        if unseen == 0:
+            kept = count
+    return kept, Stop.TOO_LONG.value
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _snap(index, p, g, box, hits, view):
+    """Draw a seed onto the centreline: (ok, p, g). It must come to rest with enough cameras."""
+    start = p.copy()
+    for trial in range(5):
+        spoke, _ = _look(index, p, g, box, hits, view)
+        if spoke < (box.min_seed_cameras if trial else box.min_cameras):
+            return False, p, g
+        if trial > 1 and box.weighted and _listen(view, g, box) < box.min_seed_cameras:
+            return False, p, g
+        before = p
+        p = _corrected(p, g, view, 2 * box.half[2])
+        g = solve_direction(view.normal, view.weight * view.turned, g)
+        moved = np.sqrt(np.sum((p - before) ** 2))
+        if np.sqrt(np.sum((p - start) ** 2)) > 3 * box.half[2]:
+            return False, p, g
+    return moved < 2 * box.gamma, p, g
+
+
+@njit(cache=True, nogil=True)
+def _grow_seeds(index, seeds, directions, box, points, cameras, begin, end, stops):
+    """Grow every seed on the same observations. Curve b is points[b, begin[b]:end[b]], the seed in the middle of the row."""
+    middle = points.shape[1] // 2
+    hits = np.empty((MAX_HITS, 5))
+    view = _new_view(len(index.cos))
+    for b in range(len(seeds)):
+        begin[b] = end[b] = middle
+        ok, p, g = _snap(index, seeds[b], directions[b], box, hits, view)
+        if not ok:
+            continue
+        points[b, middle] = p
+        spoke, _ = _look(index, p, g, box, hits, view)
+        cameras[b, middle] = spoke
+        ahead, stop_ahead = _grow_end(index, p, g, box, hits, view, points[b, middle + 1 :], cameras[b, middle + 1 :])
+        back, stop_back = _grow_end(index, p, -g, box, hits, view, points[b, middle - 1 :: -1], cameras[b, middle - 1 :: -1])
+        begin[b], end[b] = middle - back, middle + 1 + ahead
+        stops[b, 0], stops[b, 1] = stop_back, stop_ahead
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _claim(index, points, box, take):
+    """(observations of a curve (n, 3) still there, observations in all); with ``take`` they are used up (REMOVE-FEATURES)."""
+    there = total = 0
+    reach_focus = 2.5 * box.sigma_focus if box.weighted else box.half[1]
+    for j in range(len(points)):
+        tangent = points[min(j + 1, len(points) - 1)] - points[max(j - 1, 0)]
+        tangent /= np.sqrt(np.sum(tangent**2)) + 1e-30
+        for k in range(len(index.cos)):
+            frame, angle, size = _hair_frame(index, k, points[j], tangent)
+            if size < 0.2 or not _sees(index, k, frame[0, 0], frame[0, 1], frame[0, 2]):
+                continue
+            reach = np.abs(frame[1]) * box.step * 0.5 + np.abs(frame[2]) * reach_focus + np.abs(frame[3]) * box.claim
+            first_frame, last_frame = frames_between(index, k, frame[0, 2] - reach[2], frame[0, 2] + reach[2])
+            s0, s1, b0, b1 = cell_range(index, frame[0, 0], frame[0, 1], reach[0], reach[1])
+            for strip in range(s0, s1):
+                for block in range(b0, b1):
+                    start, stop = run_of(index, k, strip, block, first_frame, last_frame)
+                    for i in range(start, stop):
+                        u, v = image_of(index, i, strip, block)
+                        x, y = u - frame[0, 0], v - frame[0, 1]
+                        z = index.positions[index.first_position[k] + index.frame[i]] - frame[0, 2]
+                        if abs(frame[3, 0] * x + frame[3, 1] * y + frame[3, 2] * z) > box.claim:
+                            continue
+                        if abs(frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z) > 0.5 * box.step:
+                            continue
+                        if abs(frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z) > reach_focus:
+                            continue
+                        off = index.angle[i] * (np.pi / ANGLE_STEPS) - angle
+                        off -= np.pi * np.round(off / np.pi)
+                        if abs(off) > 2.2 * box.sigma_angle:
+                            continue
+                        total += 1
+                        there += index.strength[i] > 0
+                        if take:
+                            index.strength[i] = 0
+    return there, total
+
+
+# ---- seeds -----------------------------------------------------------------------------------------------------------
+
+
+class _Grid(NamedTuple):
+    low: np.ndarray  # (3,) mm
+    cell: float
+    shape: tuple[int, int, int]
+
+
+@njit(cache=True, nogil=True)
+def _raster(index, grid, masks, threshold):
+    """Set bit k of every cell of masks (nx, ny, nz) in which sweep k has a feature of at least the given strength."""
+    for k in range(len(index.cos)):
+        frames = index.first_position[k + 1] - index.first_position[k]
+        strips, blocks = index.columns // STRIP_PX + 1, index.rows // BLOCK_PX + 1
+        for strip in range(strips):
+            for block in range(blocks):
+                start, stop = run_of(index, k, strip, block, 0, frames)
+                for i in range(start, stop):
+                    if index.strength[i] < threshold:
+                        continue
+                    u, v = image_of(index, i, strip, block)
+                    d = index.positions[index.first_position[k] + index.frame[i]]
+                    x, y, z = _turn_back(u, v, d, index.cos[k], index.sin[k])
+                    a, b, c = int((x - grid.low[0]) / grid.cell), int((y - grid.low[1]) / grid.cell), int((z - grid.low[2]) / grid.cell)
+                    if 0 <= a < masks.shape[0] and 0 <= b < masks.shape[1] and 0 <= c < masks.shape[2]:
+                        masks[a, b, c] |= np.uint64(1) << np.uint64(k % 64)
+
+
+@njit(cache=True, nogil=True)
+def _bits(masks):
+    counts = np.empty(masks.shape, np.uint8)
+    flat, out = masks.reshape(-1), counts.reshape(-1)
+    for i in range(len(flat)):
+        n, m = 0, flat[i]
+        while m:
+            m &= m - np.uint64(1)
+            n += 1
+        out[i] = n
+    return counts
+
+
+@njit(cache=True, nogil=True)
+def _seed_directions(index, centres, cell, least, directions, cameras):
+    """Per cell: how many sweeps still have features in it, and the direction that their mean orientations agree on."""
+    for c in range(len(centres)):
+        normals, weights = np.zeros((len(index.cos), 3)), np.zeros(len(index.cos))
+        cameras[c] = 0
+        for k in range(len(index.cos)):
+            u0, v0, w0 = _turn(centres[c, 0], centres[c, 1], centres[c, 2], index.cos[k], index.sin[k])
+            first_frame, last_frame = frames_between(index, k, w0 - cell, w0 + cell)
+            s0, s1, b0, b1 = cell_range(index, u0, v0, 0.75 * cell, 0.75 * cell)
+            re = im = 0.0
+            for strip in range(s0, s1):
+                for block in range(b0, b1):
+                    start, stop = run_of(index, k, strip, block, first_frame, last_frame)
+                    for i in range(start, stop):
+                        if index.strength[i] == 0:
+                            continue
+                        u, v = image_of(index, i, strip, block)
+                        if abs(u - u0) > 0.75 * cell or abs(v - v0) > 0.75 * cell:
+                            continue
+                        double = index.angle[i] * (2 * np.pi / ANGLE_STEPS)
+                        re += np.cos(double)
+                        im += np.sin(double)
+            size = np.hypot(re, im)
+            if size < 1.0:
+                continue
+            cameras[c] += 1
+            angle = 0.5 * np.arctan2(im, re)
+            sx, sy, sz = _slope(u0, v0, index.distance)
+            ou, ov = np.cos(angle), np.sin(angle)
+            n = np.array((ov * sz, -ou * sz, ou * sy - ov * sx))
+            n /= np.sqrt(np.sum(n**2))
+            normals[k] = _turn_back(n[0], n[1], n[2], index.cos[k], index.sin[k])
+            weights[k] = 1.0
+        if cameras[c] < least:
+            continue
+        guess = np.array((0.1, 1.0, 0.05))
+        directions[c] = solve_direction(normals, weights, guess / np.sqrt(np.sum(guess**2)))
+
+
+def _seed_grid(index: Index, params: GrowParams) -> _Grid:
+    """The cells of the captured volume: every point that a sweep can have in focus."""
+    corners = np.array([(c, r) for c in (0, index.columns - 1) for r in (0, index.rows - 1)], float)
+    u, v = to_image(corners[:, 0], corners[:, 1], index.pitch, index.axis_col, index.axis_row)
+    reach = float(np.hypot(np.abs(u).max(), np.abs(index.positions).max()))
+    low, high = np.array([-reach, v.min(), -reach]), np.array([reach, v.max(), reach])
+    shape = tuple(int(np.ceil(n)) for n in (high - low) / params.seed_cell_mm)
+    return _Grid(low, params.seed_cell_mm, shape)
+
+
+def _seeds(index: Index, params: GrowParams) -> np.ndarray:
+    """Centres (n, 3) mm of the cells that at least ``min_seed_cameras`` sweeps recorded, most angles first."""
+    grid = _seed_grid(index, params)
+    masks = np.zeros(grid.shape, np.uint64)
+    _raster(index, grid, masks, 1)
+    counts = _bits(masks)
+    cells = np.flatnonzero(counts.ravel() >= params.min_seed_cameras)
+    found = counts.ravel()[cells]
+    shuffled = np.random.default_rng(0).permutation(len(cells))  # neighbours in a batch would grow the same fiber
+    order = shuffled[np.argsort(-found[shuffled].astype(int), kind="stable")]
+    where = np.stack(np.unravel_index(cells[order], grid.shape), -1)
+    return grid.low + (where + 0.5) * grid.cell
+
+
+# ---- the whole -------------------------------------------------------------------------------------------------------
+
+
+def grow(index: Index, params: GrowParams, workers: int = 1, progress: Progress = silent) -> Grown:
+    """Every fiber that the observations support, on ``workers`` threads. Uses up ``index.strength``.
+
+    Deterministic: the same index and parameters give the same curves in the same order, whatever the number of threads.
+    """
+    box = _box(params, index)
+    centres = _seeds(index, params)
+    store = _BatchStore.of(BATCH, 2 * min(box.max_points, _longest(index, params)) + 1)
+    curves: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    block = 16 * BATCH
+    with ThreadPoolExecutor(workers) as pool:
+        for start in range(0, len(centres), block):
+            progress("growing", start, len(centres))
+            some = centres[start : start + block]
+            directions, cameras = np.zeros((len(some), 3)), np.zeros(len(some), np.int64)
+            least = params.min_seed_cameras
+            _in_parts(pool, 256, len(some), lambda s: _seed_directions(index, some[s], params.seed_cell_mm, least, directions[s], cameras[s]))  # noqa: B023
+            good = np.flatnonzero(cameras >= least)
+            for first in range(0, len(good), BATCH):
+                chosen = good[first : first + BATCH]
+                seeds, ways = some[chosen], directions[chosen]
+                _in_parts(pool, 8, len(chosen), lambda s: _grow_seeds(index, seeds[s], ways[s], box, *store.part(s)))  # noqa: B023
+                curves += _accept(index, store, len(chosen), params, box)
+    progress("growing", len(centres), len(centres))
+    return _flat(curves, len(centres))
+
+
+def _in_parts(pool: ThreadPoolExecutor, size: int, count: int, work) -> None:
+    """Call work(slice) for slices of ``size`` that cover range(count); the kernels let go of the interpreter's lock."""
+    for _ in pool.map(work, [slice(i, min(i + size, count)) for i in range(0, count, size)]):
+        pass
+
+
+def _longest(index: Index, params: GrowParams) -> int:
+    """Steps of the longest fiber worth making room for: ten times the height of the captured volume."""
+    return int(10 * index.rows * index.pitch / params.step_mm) + 10
+
+
+@dataclass(frozen=True)
+class _BatchStore:
+    """Room for the curves of a batch, made once."""
+
+    points: np.ndarray
+    cameras: np.ndarray
+    begin: np.ndarray
+    end: np.ndarray
+    stops: np.ndarray
+
+    @classmethod
+    def of(cls, seeds: int, points: int) -> "_BatchStore":
+        counts = [np.zeros(seeds, np.int64) for _ in range(2)]
+        return cls(np.empty((seeds, points, 3)), np.empty((seeds, points), np.uint8), *counts, np.zeros((seeds, 2), np.uint8))
+
+    def part(self, s: slice):
+        return self.points[s], self.cameras[s], self.begin[s], self.end[s], self.stops[s]
+
+
+def _accept(index, store: _BatchStore, count: int, params: GrowParams, box: _Box):
+    """The curves of a batch that are long enough and stand on observations of their own, longest first."""
+    sizes = store.end[:count] - store.begin[:count]
+    accepted = []
+    for b in np.argsort(-sizes, kind="stable"):
+        if (sizes[b] - 1) * params.step_mm < params.min_length_mm:
+            break
+        points = store.points[b, store.begin[b] : store.end[b]].copy()
+        there, total = _claim(index, points, box, False)
+        if there < 0.5 * total or total == 0:
+            continue
+        _claim(index, points, box, True)
+        accepted.append((points, store.cameras[b, store.begin[b] : store.end[b]].copy(), store.stops[b].copy()))
+    return accepted
+
+
+def _flat(curves, tried: int) -> Grown:
+    if not curves:
+        return Grown(np.zeros((0, 3), np.float32), np.zeros(1, np.int64), np.zeros(0, np.uint8), np.zeros((0, 2), np.uint8), tried)
+    points, cameras, stops = zip(*curves, strict=True)
+    offsets = np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64)
+    return Grown(np.concatenate(points).astype(np.float32), offsets, np.concatenate(cameras), np.stack(stops), tried)

@@ -1,0 +1,318 @@
+"""The whole flow: a capture's photographs -> ridges -> features -> fibers -> hull and infill -> strands.
+
+What a run needs to go on after a crash lies in a folder beside the output, one finished file a sweep.
+"""
+
+import hashlib
+import json
+import multiprocessing
+import os
+import threading
+import tomllib
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from .capture import Capture, load_capture
+from .errors import CaptureError, StrandscopeError
+from .features import SweepFeatures, build_index, load_features, pack, save_features, unpack
+from .files import atomic
+from .grow import PAPER, Grown, GrowParams, grow
+from .hull import HullParams, blueness, carve, grid_of, occupancy, visual_hull
+from .infill import InfillParams, infill
+from .progress import Progress, silent
+from .ridges import RidgeParams, Ridges, detect, estimate
+from .strands import CAPTURED, INFILL, Strands, concatenate, save_strands
+
+VERSION = "0.1.0"
+WORKING_ROOM = 600_000_000  # bytes: the program itself, seed cells, a batch of curves
+SAMPLED_PHOTOGRAPHS = 24  # that ``estimate`` looks at
+# Table 1: c in 12-bit numbers with the black level (128) in it, omega in degrees, gamma in px, boxes in px
+_TABLE_1 = {"straight": (-140, 1.5, 0.5, (40.0, 30.0, 8.0)), "wavy": (-90, 1.5, 0.5, (60.0, 30.0, 8.0)), "curls": (-70, 1.5, 0.5, (60.0, 30.0, 8.0))}
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """One frozen object a stage."""
+
+    ridges: RidgeParams = field(default_factory=RidgeParams)
+    grow: GrowParams = field(default_factory=GrowParams)
+    hull: HullParams = field(default_factory=HullParams)
+    infill: InfillParams | None = field(default_factory=InfillParams)  # None: captured fibers only
+
+
+def preset(name: str = "auto", method: str = "strandscope") -> Parameters:
+    """The parameters of a preset: "auto", or the hair of Table 1, "straight", "wavy", "curls".
+
+    method "paper" is the paper's own operator and growing with Table 1's constants; else the cone, the bound of the
+    correction and the boxes are Table 1's and all that depends on the camera's light is estimated.
+    """
+    c, omega, gamma, boxes = _TABLE_1["straight" if name == "auto" else name]
+    bounds = {"cone_deg": omega, "max_correction_px": gamma, "box_px": boxes}
+    if method == "paper":
+        ridges = RidgeParams("paper", low=0.03, high=0.08, offset=(c + 128) / (4095 - 128))
+        return Parameters(ridges=ridges, grow=replace(PAPER, **bounds))
+    return Parameters(grow=replace(GrowParams(), **bounds))
+
+
+def reconstruct(
+    capture_path: Path, out: Path, parameters: Parameters, *, workers: int = 1, memory_bytes: int = 6 * 10**9, progress: Progress = silent
+) -> Strands:
+    """Reconstruct a capture and write its strands to ``out`` (.npz); returns them.
+
+    The same capture and parameters give the same bytes for any number of workers. Raises CaptureError for a capture that
+    cannot be read, StrandscopeError where nothing was found or written, or more than ``memory_bytes`` would be needed.
+    """
+    capture = load_capture(capture_path)
+    parameters = _resolve(capture, parameters)
+    work = _work_folder(capture, Path(out), parameters)
+    sweeps = find_features(capture, work, parameters, workers, progress)
+    _check_memory(sweeps, memory_bytes)
+    grown = grow(build_index(sweeps, capture.optics), parameters.grow, workers, progress)
+    if len(grown.offsets) < 2:
+        raise StrandscopeError(
+            f"{capture.folder}: no fiber was found in {sum(map(len, sweeps))} features; expected hairs in focus in the photographs"
+        )
+    provenance = {"capture": capture.name, "version": VERSION, "parameters": asdict(parameters)}
+    strands = captured_strands(grown, parameters.grow, provenance)
+    if parameters.infill is not None:
+        strands = concatenate([strands, infill_strands(capture, work, sweeps, strands, parameters, workers, progress)], provenance)
+    save_strands(out, strands)
+    return strands
+
+
+# ---- photographs -> features -----------------------------------------------------------------------------------------
+
+
+def find_features(capture: Capture, work: Path, parameters: Parameters, workers: int, progress: Progress) -> list[SweepFeatures]:
+    """The features of every sweep, filtered from the photographs unless ``work`` has them from a run before."""
+    missing = [i for i in range(len(capture.sweeps)) if not (_features_path(work, i).is_file() and _blueness_path(work, i).is_file())]
+    shape, total = capture.shape, sum(len(capture.sweeps[i].files) for i in missing)
+    jobs = [(capture, file, parameters, shape) for i in missing for file in capture.sweeps[i].files]
+    done = 0
+    with _processes(workers) as run:
+        results = run(_filter, jobs)
+        for i in missing:
+            sweep, ridges, blues = capture.sweeps[i], [], []
+            for _ in sweep.files:
+                progress("finding ridges", done, total)
+                found, blue = next(results)
+                ridges.append(found)
+                blues.append(blue)
+                done += 1
+            with atomic(_blueness_path(work, i)) as part:
+                np.save(part, np.stack(blues))
+            save_features(_features_path(work, i), pack(sweep.angle_deg, sweep.positions_mm, shape, ridges))
+    progress("finding ridges", total, total)
+    return [load_features(_features_path(work, i)) for i in range(len(capture.sweeps))]
+
+
+def _filter(job: tuple[Capture, str, Parameters, tuple[int, int]]) -> tuple[Ridges, np.ndarray]:
+    """One photograph: its ridges on the red plane, and its picture of blueness."""
+    capture, file, parameters, shape = job
+    planes = capture.planes(file, "RGB")
+    if planes.shape[1:] != shape:
+        found, first = (f"{2 * s[1]} x {2 * s[0]}" for s in (planes.shape[1:], shape))
+        raise CaptureError(f"{capture.folder / file}: the photograph has {found} pixels; expected {first}, as {capture.sweeps[0].files[0]}")
+    return detect(planes[0], parameters.ridges), blueness(planes, parameters.hull)
+
+
+@contextmanager
+def _processes(workers: int) -> Iterator:
+    """An ordered ``map`` over ``workers`` processes; this one alone for a single worker. Leaving it early cancels the rest."""
+    if workers == 1:
+        yield map
+        return
+    limits = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+    before = {name: os.environ.get(name) for name in limits}
+    os.environ.update(limits)  # for the children that spawn below; one thread each
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_end_with_parent)
+    try:
+        yield lambda function, jobs: pool.map(function, jobs, chunksize=4)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+def _end_with_parent() -> None:
+    """A worker whose parent was killed must not live on."""
+
+    def wait():
+        multiprocessing.parent_process().join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def _check_memory(sweeps: list[SweepFeatures], memory_bytes: int) -> None:
+    """Raise StrandscopeError where the features alone, 8 bytes each and 4 a cell, and room to work, do not fit."""
+    needed = sum(8 * len(s) + 4 * len(s.cells) for s in sweeps) + WORKING_ROOM
+    if needed > memory_bytes:
+        told, allowed = (f"{n / 1e9:.1f} GB" for n in (needed, memory_bytes))
+        raise StrandscopeError(f"{sum(map(len, sweeps))} features need about {told} of memory; {allowed} are allowed (--memory), give more")
+
+
+def _features_path(work: Path, i: int) -> Path:
+    return work / f"sweep_{i:03d}.features"
+
+
+def _blueness_path(work: Path, i: int) -> Path:
+    return work / f"sweep_{i:03d}.blueness.npy"
+
+
+def _resolve(capture: Capture, parameters: Parameters) -> Parameters:
+    """Fill in what the parameters leave to be estimated from the photographs."""
+    if parameters.ridges.offset is not None:
+        return parameters
+    photographs = [(sweep, file) for sweep in capture.sweeps for file in sweep.files]
+    chosen = photographs[:: max(len(photographs) // SAMPLED_PHOTOGRAPHS, 1)]
+    return replace(parameters, ridges=estimate([capture.planes(file)[0] for _, file in chosen], parameters.ridges))
+
+
+def _work_folder(capture: Capture, out: Path, parameters: Parameters) -> Path:
+    """The folder beside ``out`` for this capture and these parameters of the filter; emptied when they were others."""
+    stats = [(f, os.stat(capture.folder / f)) for s in capture.sweeps for f in s.files]
+    told = {
+        "version": VERSION,
+        "optics": asdict(capture.optics),
+        "sweeps": [asdict(sweep) for sweep in capture.sweeps],
+        "files": [[name, stat.st_size, stat.st_mtime_ns] for name, stat in stats],
+        "ridges": asdict(parameters.ridges),
+        "hull": [parameters.hull.block_px, parameters.hull.dark],
+    }
+    digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    work = out.with_name(out.stem + ".work")
+    stamp = work / "made-from.txt"
+    if not stamp.is_file() or stamp.read_text() != digest:
+        for old in work.glob("sweep_*"):
+            old.unlink()
+        with atomic(stamp) as part:
+            part.write_text(digest)
+    return work
+
+
+# ---- fibers -> strands -----------------------------------------------------------------------------------------------
+
+
+def captured_strands(grown: Grown, params: GrowParams, provenance: dict) -> Strands:
+    """The grown curves as strands. Confidence rises with the cameras that agreed on a point: 1 - exp(-cameras / 4)."""
+    return Strands(
+        points_mm=grown.points_mm,
+        offsets=grown.offsets,
+        radius_mm=np.full(len(grown.points_mm), params.radius_mm, np.float32),
+        kind=np.full(len(grown.offsets) - 1, CAPTURED, np.uint8),
+        confidence=(1 - np.exp(-grown.cameras / 4)).astype(np.float32),
+        stops=grown.stops,
+        provenance=provenance,
+    )
+
+
+def infill_strands(
+    capture: Capture, work: Path, sweeps: list[SweepFeatures], strands: Strands, parameters: Parameters, workers: int, progress: Progress
+) -> Strands:
+    """Hair for the inside that no camera sees (sec. 4.3), along the captured ``strands``."""
+    optics, params = capture.optics, parameters.hull
+    with _threads(workers):
+        grid = grid_of(optics, capture.shape, capture.sweeps, params.voxel_mm)
+        hull = visual_hull(_counted(_blue_stacks(capture, work), len(sweeps), "visual hull", progress), optics, grid, params)
+        rays = carve(_counted(_rays(sweeps, capture), len(sweeps), "space carving", progress), optics, grid, params)
+        filled = infill(strands.points_mm, strands.offsets, strands.radius_mm, occupancy(hull, rays, grid, params), grid, parameters.infill, progress)
+    count = len(filled.offsets) - 1
+    return Strands(
+        points_mm=filled.points_mm,
+        offsets=filled.offsets,
+        radius_mm=filled.radius_mm,
+        kind=np.full(count, INFILL, np.uint8),
+        confidence=np.zeros(len(filled.points_mm), np.float32),
+        stops=np.zeros((count, 2), np.uint8),
+    )
+
+
+def _blue_stacks(capture: Capture, work: Path) -> Iterator:
+    for i, sweep in enumerate(capture.sweeps):
+        yield sweep.angle_deg, sweep.positions_mm, np.load(_blueness_path(work, i), mmap_mode="r")
+
+
+def _rays(sweeps: list[SweepFeatures], capture: Capture) -> Iterator:
+    for sweep in sweeps:
+        yield sweep.angle_deg, *unpack(sweep, capture.optics)[:3]
+
+
+def _counted(items: Iterator, total: int, stage: str, progress: Progress) -> Iterator:
+    """The items, with progress told between them."""
+    for i, item in enumerate(items):
+        progress(stage, i, total)
+        yield item
+    progress(stage, total, total)
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """Let numba's parallel kernels use ``count`` threads, or as many as there are."""
+    import numba
+
+    before = numba.get_num_threads()
+    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
+
+
+# ---- parameters as TOML ----------------------------------------------------------------------------------------------
+
+
+def write_toml(path: Path, parameters: Parameters) -> None:
+    """Write parameters as TOML, a table a stage; what is to be estimated is left out."""
+    import tomli_w
+
+    with atomic(path) as part:
+        part.write_text(tomli_w.dumps(_without_none(asdict(parameters))), encoding="utf-8")
+
+
+def read_toml(path: Path) -> Parameters:
+    """Read parameters from TOML; what is not there has its default. Raises StrandscopeError naming file and field."""
+    try:
+        tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise StrandscopeError(f"{path}: not found; expected a TOML file with parameters") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise StrandscopeError(f"{path}: not valid TOML: {error}") from error
+    return _filled(Parameters(), tables, path, "")
+
+
+def _without_none(values: dict) -> dict:
+    return {k: _without_none(v) if isinstance(v, dict) else v for k, v in values.items() if v is not None}
+
+
+def _filled(record, values: dict, path: Path, where: str):
+    """``record`` with the fields that ``values`` gives, checked by name and kind."""
+    known = {f.name: getattr(record, f.name) for f in fields(record)}
+    changes = {}
+    for name, value in values.items():
+        if name not in known:
+            raise StrandscopeError(f"{path}: {where}{name} is not a parameter; expected one of {', '.join(known)}")
+        old = known[name]
+        if is_dataclass(old):
+            changes[name] = _filled(old, value if isinstance(value, dict) else {"?": value}, path, f"{where}{name}.")
+        elif isinstance(old, tuple):
+            good = isinstance(value, list) and len(value) == len(old) and all(_is_number(v) for v in value)
+            changes[name] = tuple(map(float, value)) if good else _wrong(path, where + name, value, f"{len(old)} numbers")
+        elif isinstance(old, bool | str):
+            changes[name] = value if isinstance(value, type(old)) else _wrong(path, where + name, value, type(old).__name__)
+        else:
+            changes[name] = value if _is_number(value) else _wrong(path, where + name, value, "a number")
+    return replace(record, **changes)
+
+
+def _is_number(value) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _wrong(path: Path, name: str, value, expected: str):
+    raise StrandscopeError(f"{path}: {name} is {value!r}; expected {expected}")
