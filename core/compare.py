@@ -131,7 +131,7 @@ def summary(report: dict) -> list[tuple[str, str]]:
         rows.append(("pieces a hair", figure(report["fragments_per_matched_hair"], ".2f", "")))
         rows.append(("switches", figure(report["identity_switch_fraction"], ".3f", "of the curves jump from one hair to another")))
     bins = report["recall_by_visible_angles"].items()
-    rows += [(f"recall, {name} angles", figure(share, ".3f", f"of {count} points")) for name, (share, count) in bins]
+    rows += [(f"recall, {name} angles", figure(share, ".3f", f"of {count} points")) for name, (share, count) in bins if count]
     return [(name, value.rstrip()) for name, value in rows]
 
 

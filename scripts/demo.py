@@ -1,16 +1,12 @@
 """The whole path once, into demo/. Linux and macOS: ./scripts/demo; Windows: py -3.13 scripts/demo.py"""
 
-import shutil
-
 from _env import ROOT, python, step
 
 strandscope = (python(), "-P", "-m", "strandscope")
 demo = ROOT / "demo"
 capture, truth, strands = demo / "capture", demo / "capture" / "truth.npz", demo / "strands.npz"
 
-if not (capture / "capture.json").exists():
-    shutil.rmtree(capture, ignore_errors=True)  # photographs of a run that was interrupted
-    step("1/7 Photographing a lock of known hair (simulated) …", *strandscope, "simulate", capture, "--style", "straight", "--scale", "small")
+step("1/7 Photographing a lock of known hair (simulated) …", *strandscope, "simulate", capture, "--style", "straight", "--scale", "small")
 step("2/7 Finding the hairs in the photographs …", *strandscope, "reconstruct", capture, "-o", strands, "--preset", "straight")
 step("3/7 Comparing them with the hairs that are there …", *strandscope, "score", strands, truth, "--json", demo / "score.json")
 step("4/7 Counting and measuring …", *strandscope, "stats", strands, "--json", demo / "stats.json")

@@ -14,7 +14,9 @@ def make(curves, kind=None):
     points = np.concatenate(curves).astype(np.float32)
     kinds = np.zeros(len(curves), np.uint8) if kind is None else np.asarray(kind, np.uint8)
     sizes = [len(curve) for curve in curves]
-    return Strands(points, offsets_of(sizes), np.full(len(points), 0.04, np.float32), kinds, np.ones(len(points), np.float32), {"capture": "x"})
+    return Strands(
+        points, offsets_of(sizes), np.full(len(points), 0.04, np.float32), kinds, np.ones(len(points), np.float32), provenance={"capture": "x"}
+    )
 
 
 def vertical(x, low, high, n=5):
@@ -28,14 +30,19 @@ def test_what_is_saved_is_loaded_and_the_bytes_are_the_same(tmp_path_factory, si
     n = sum(sizes)
     points, radius, confidence = rng.normal(size=(n, 3)), rng.uniform(0.01, 0.1, n), rng.uniform(size=n)
     strands = Strands(
-        *(points.astype(np.float32), offsets_of(np.array(sizes, int)), radius.astype(np.float32)),
-        *(rng.integers(0, 2, len(sizes)).astype(np.uint8), confidence.astype(np.float32), {"b": 1, "a": "ü"}),
+        points_mm=points.astype(np.float32),
+        offsets=offsets_of(np.array(sizes, int)),
+        radius_mm=radius.astype(np.float32),
+        kind=rng.integers(0, 2, len(sizes)).astype(np.uint8),
+        confidence=confidence.astype(np.float32),
+        stops=rng.integers(0, 5, (len(sizes), 2)).astype(np.uint8),
+        provenance={"b": 1, "a": "ü"},
     )
     folder = tmp_path_factory.mktemp("strands")
     for name in ("one.npz", "two.npz"):
         save_strands(folder / name, strands)
     loaded = load_strands(folder / "one.npz")
-    for field in ("points_mm", "offsets", "radius_mm", "kind", "confidence"):
+    for field in ("points_mm", "offsets", "radius_mm", "kind", "confidence", "stops"):
         np.testing.assert_array_equal(getattr(loaded, field), getattr(strands, field))
         assert getattr(loaded, field).dtype == getattr(strands, field).dtype
     assert loaded.provenance == strands.provenance
@@ -50,12 +57,14 @@ def test_what_is_saved_is_loaded_and_the_bytes_are_the_same(tmp_path_factory, si
         ("radius", lambda a: 0 * a, "radius"),
         ("radius", lambda a: a * np.inf, r"radius\[0\] is inf"),
         ("confidence", lambda a: a[:-1], "confidence"),
+        ("confidence", lambda a: a - 1.5, "confidence"),
         ("offsets", lambda a: a[::-1].copy(), "offsets"),
         ("offsets", lambda a: a + 0.5, "offsets"),
         ("offsets", lambda a: np.r_[a[:-1], a[-1] + 1], "offsets"),
         ("offsets", lambda a: a[:0], "offsets"),
         ("offsets", lambda _: np.array(3), "offsets"),
         ("kind", lambda a: a + 7, "kind"),
+        ("stops", lambda a: a[:, 0], "stops"),
         ("provenance", lambda _: np.array("{"), "provenance"),
     ],
 )
