@@ -206,7 +206,7 @@ def captured_strands(grown: Grown, params: GrowParams, provenance: dict) -> Stra
         offsets=grown.offsets,
         radius_mm=np.full(len(grown.points_mm), params.radius_mm, np.float32),
         kind=np.full(len(grown.offsets) - 1, CAPTURED, np.uint8),
-        confidence=(1 - np.exp(-grown.cameras / 4)).astype(np.float32),
+        confidence=(1 - np.exp(grown.cameras / -4.0)).astype(np.float32),
         stops=grown.stops,
         provenance=provenance,
     )
