@@ -1,0 +1,651 @@
+"""Photographs of known hair: a groom seen through a thin lens, written as a capture with its truth.
+
+A photograph is the mean over points on the lens. From each, all fibers are drawn as opaque cylinders of their true
+radius by an exact perspective whose plane w = d stays in place, with hidden surfaces removed and with a shift of its own
+below a pixel. Occlusion within the cone of rays, blur, perspective and smooth edges follow from that; nothing is blurred
+afterwards.
+
+A pixel of one colour gathers light over a whole cell of the mosaic, as behind the blur filter of such sensors.
+"""
+
+import json
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+
+from . import geometry
+from .capture import FILE_NAME, Capture, Sweep, Turntable, load_capture, save_capture
+from .errors import StrandscopeError
+from .files import atomic, explain
+from .geometry import Optics
+from .groom import STYLES, Groom, GroomParams, groom
+from .progress import Progress, silent
+from .raw import write_dng
+
+BLACK, WHITE = 512, 15871  # of the sensor, 14 bit
+JOURNAL = "simulation.json"  # what was asked for, to know whether a run can be continued
+REVISION = 1  # raise it when the same parameters give other photographs
+_SITES = ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2))  # of the RGGB cell: row, column, colour
+_PROFILE = 256  # brightnesses across a fiber that are told apart
+_BARE = -1  # no fiber here
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How large a capture is: seconds or hours."""
+
+    rows: int  # of a channel plane
+    columns: int
+    angles: int  # sweeps, evenly around
+    half_range_mm: float  # the camera goes from d = -half_range to +half_range
+    fibers: int
+    lock_radius_mm: float
+    turntable: int  # photographs of the validation sequence
+
+
+SCALES = {
+    "tiny": Scale(210, 210, 12, 2.4, 24, 1.4, 4),  # seconds
+    "small": Scale(300, 260, 24, 3.4, 110, 2.6, 8),  # a minute
+    "medium": Scale(420, 420, 24, 6.0, 340, 4.6, 24),  # minutes
+    "paper": Scale(1462, 2193, 24, 37.5, 3000, 18.0, 360),  # hours: the capture of the paper, sec. 3
+}
+
+
+@dataclass(frozen=True)
+class SimulateParams:
+    """What to simulate. The optics are those of sec. 3; the same parameters give the same bytes."""
+
+    style: str = "straight"  # one of groom.STYLES
+    scale: str = "small"  # one of SCALES
+    fibers: int | None = None  # None: as many as the scale has
+    seed: int = 0
+    working_distance_mm: float = 330.0
+    pitch_mm: float = 1 / 35
+    aperture_cone_deg: float = 10.0
+    step_mm: float = 0.2  # between photographs of a sweep
+    full_well_e: float = 30000.0  # electrons at white level: sets the shot noise
+    read_noise_e: float = 6.0  # electrons, rms
+    exposure: float = 0.75  # of white: what the brightest hundredth of the hair reaches in red
+    open_f_number: float = 2.8  # the f-number at which the aperture has the cone above
+    turntable_f_number: float = 16.0
+
+
+@dataclass(frozen=True)
+class Look:
+    """Colours of hair and background, linear R, G, B of the sensor relative to white."""
+
+    hair: tuple[float, float, float]  # light that enters the fiber and comes back
+    shine: float  # of the white highlight, relative to it
+    depth: float  # how much of the light a layer of hair takes away, 0 … 1
+    board: tuple[float, float, float] = (0.045, 0.085, 0.23)
+
+
+LOOKS = {
+    "straight": Look((0.60, 0.43, 0.27), 0.55, 0.75),  # medium brown
+    "wavy": Look((0.80, 0.64, 0.42), 0.40, 0.55),  # blond
+    "curls": Look((0.40, 0.27, 0.17), 0.80, 0.90),  # dark brown
+}
+
+
+# ---- the lens --------------------------------------------------------------------------------------------------------
+
+
+def lens_points(count: int, radius_mm: float, rng) -> np.ndarray:
+    """Points (count, 4): place on the lens disc (2, mm) and shift of the photograph (2, in pixels, -0.5 … 0.5).
+
+    A sunflower's spiral on the disc and the R2 sequence for the shifts: both even in every direction at any count; turned
+    and shifted by ``rng``, so that no two photographs repeat a pattern.
+    """
+    i = np.arange(count)
+    radius = radius_mm * np.sqrt((i + 0.5) / count)
+    angle = i * np.pi * (3 - np.sqrt(5)) + 2 * np.pi * rng.random()
+    plastic = 1.32471795724474602596
+    shift = (np.stack([i / plastic, i / plastic**2], axis=-1) + rng.random(2)) % 1.0 - 0.5
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), shift])
+
+
+def aperture_radius_mm(optics: Optics) -> float:
+    """Radius of the lens whose cone of rays has the full angle ``aperture_cone_deg``."""
+    return optics.working_distance_mm * math.tan(math.radians(optics.aperture_cone_deg) / 2)
+
+
+def lens_count(optics: Optics, depth_mm: float) -> int:
+    """How many points on the lens make a fiber ``depth_mm`` out of focus an even blur, without copies of it.
+
+    Enough that neighbouring copies lie 0.4 px apart on average: a fiber is 2 to 4 px wide. Beyond 256 the copies of a
+    single fiber are fainter than the sensor's noise.
+    """
+    blur_px = 2 * aperture_radius_mm(optics) * depth_mm / (optics.working_distance_mm * optics.pitch_mm)
+    return int(np.clip(2.5 * blur_px, 48, 256))
+
+
+# ---- hair, ready to be drawn -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Hair:
+    """Straight pieces of fibers in the object frame, with what it takes to shade them."""
+
+    points_mm: np.ndarray  # (V, 3) float64
+    tangents: np.ndarray  # (V, 3) unit
+    radius_mm: np.ndarray  # (V,)
+    fiber: np.ndarray  # (V,) int32
+    tint: np.ndarray  # (V,) brightness of its own, about 1
+    segments: np.ndarray  # (S,) int64: segment k joins points segments[k] and segments[k] + 1
+
+
+def prepare(groom: Groom, rng, chord_error_mm: float = 0.0015) -> Hair:
+    """Leave out points of a groom that a chord passes within ``chord_error_mm``, and give each fiber a tint of its own."""
+    kept, tints, tangents = [], [], []
+    for i in range(len(groom)):
+        points = groom[i]
+        keep = _thin(points, chord_error_mm)
+        along = np.gradient(points, axis=0)[keep]
+        tangents.append(along / np.linalg.norm(along, axis=1, keepdims=True))
+        kept.append(keep + groom.offsets[i])
+        tints.append(rng.lognormal(0, 0.16) * (1 + 0.06 * _texture(points[keep, 1], rng)))
+    fiber = np.repeat(np.arange(len(groom), dtype=np.int32), [len(k) for k in kept])
+    kept = np.concatenate(kept)
+    segments = np.flatnonzero(np.diff(fiber) == 0)
+    return Hair(groom.points_mm[kept], np.concatenate(tangents), groom.radii_mm[fiber], fiber, np.concatenate(tints), segments)
+
+
+def _thin(points: np.ndarray, chord_error_mm: float) -> np.ndarray:
+    """Indices of every k-th point, both ends included, with k so that chords stay within the error."""
+    bend = np.linalg.norm(np.diff(points, 2, axis=0), axis=1).max(initial=0)  # of the curve, times step²
+    every = max(int(np.sqrt(8 * chord_error_mm / max(bend, 1e-12))), 1)
+    count = max(int(np.ceil((len(points) - 1) / every)), 1)
+    return np.unique(np.linspace(0, len(points) - 1, count + 1).round().astype(np.int64))
+
+
+def _texture(y: np.ndarray, rng) -> np.ndarray:
+    """Slow random changes along a fiber, rms about 1."""
+    lengths, phases = rng.uniform(0.6, 4.0, 5), rng.uniform(0, 2 * np.pi, 5)
+    return np.sin(2 * np.pi * y[:, None] / lengths + phases).sum(axis=1) * np.sqrt(2 / 5)
+
+
+# ---- light -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Shade:
+    """Light from each point of the hair towards the camera at one turntable angle."""
+
+    color: np.ndarray  # (V, 3) float32, where a fiber faces the camera
+    shine: np.ndarray  # (V,) float32: share of the highlight in it, 0 … 1
+
+
+def light_directions() -> np.ndarray:
+    """Unit directions (9, 3) in the camera frame to the parts of a soft light of 60° by 60° behind the camera, sec. 3."""
+    at = np.tan(np.radians([-20.0, 0.0, 20.0]))
+    directions = np.array([[x, y, 1.0] for y in at for x in at])
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+@dataclass(frozen=True)
+class Density:
+    """How much hair is where: a grid of its cross-section in mm² a mm³, object frame."""
+
+    values: np.ndarray  # (nx, ny, nz) float32
+    low_mm: np.ndarray  # (3,) corner of the grid
+    cell_mm: float
+
+
+def density(hair: Hair, cell_mm: float = 0.3) -> Density:
+    """Cross-section of fibers a volume, from the midpoints of their segments."""
+    a, b = hair.points_mm[hair.segments], hair.points_mm[hair.segments + 1]
+    low = hair.points_mm.min(axis=0) - 2 * cell_mm
+    shape = np.ceil((hair.points_mm.max(axis=0) + 2 * cell_mm - low) / cell_mm).astype(int) + 1
+    area = 2 * hair.radius_mm[hair.segments] * np.linalg.norm(b - a, axis=1)
+    cells = ((a + b) / 2 - low) / cell_mm
+    grid = np.zeros(shape)
+    base = np.floor(cells - 0.5).astype(int)
+    part = cells - 0.5 - base
+    for corner in np.ndindex(2, 2, 2):
+        weight = np.prod(np.where(corner, part, 1 - part), axis=1)
+        np.add.at(grid, tuple((base + corner).T), area * weight)
+    return Density((grid / cell_mm**3).astype(np.float32), low, cell_mm)
+
+
+def shade(hair: Hair, fog: Density, look: Look, angle_deg: float, working_distance_mm: float) -> Shade:
+    """Light from the hair towards a camera at ``angle_deg``: a diffuse part by the sine of the angle between light and
+    fiber, two highlights along the fiber, and less of all where hair stands before the light."""
+    directions = light_directions()
+    through = _through(hair.points_mm, fog.values, fog.low_mm, fog.cell_mm, geometry.object_points(directions, angle_deg), look.depth)
+    where = geometry.camera_points(hair.points_mm, angle_deg)
+    tangents = geometry.camera_points(hair.tangents, angle_deg)
+    view = np.array([0.0, 0.0, working_distance_mm]) - where
+    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    sin_view = np.einsum("vi,vi->v", tangents, view)
+    diffuse, first, second = np.zeros((3, len(where)))
+    for direction, open_share in zip(directions, through.T, strict=True):
+        sin_light = tangents @ direction  # sines of the inclinations to the plane across the fiber
+        half = (np.arcsin(np.clip(sin_light, -1, 1)) + np.arcsin(np.clip(sin_view, -1, 1))) / 2
+        diffuse += open_share * np.sqrt(np.clip(1 - sin_light**2, 0, 1))
+        first += open_share * np.exp(-0.5 * ((half + np.radians(3)) / np.radians(7)) ** 2)  # off the cuticle, whose scales tilt
+        second += open_share * np.exp(-0.5 * ((half - np.radians(4.5)) / np.radians(11)) ** 2)  # through the fiber and back
+    count = len(directions)
+    hair_color = np.array(look.hair)
+    body = (0.62 * diffuse / count)[:, None] * hair_color + (0.5 * second / count)[:, None] * hair_color**1.5
+    white = look.shine * hair_color[0] * first / count
+    color = hair.tint[:, None] * body + white[:, None]
+    return Shade(color.astype(np.float32), (white / color[:, 0]).astype(np.float32))
+
+
+@njit(cache=True, nogil=True)
+def _through(points, grid, low, cell, directions, depth):
+    """Share of light (V, L) that reaches points from directions (L, 3) through the grid of hair; depth scales its toll."""
+    result = np.empty((len(points), len(directions)))
+    nx, ny, nz = grid.shape
+    for v in range(len(points)):
+        for k in range(len(directions)):
+            total = 0.0
+            travelled = 1.2 * cell  # the fiber itself and its nearest neighbours are seen, not guessed
+            while True:
+                x = (points[v, 0] + travelled * directions[k, 0] - low[0]) / cell
+                y = (points[v, 1] + travelled * directions[k, 1] - low[1]) / cell
+                z = (points[v, 2] + travelled * directions[k, 2] - low[2]) / cell
+                if not (0 <= x < nx and 0 <= y < ny and 0 <= z < nz):
+                    break
+                total += grid[int(x), int(y), int(z)]
+                travelled += cell
+            toll = total * cell
+            result[v, k] = 0.8 * math.exp(-depth * toll) + 0.2 * math.exp(-0.3 * depth * toll)  # the rest was scattered on
+    return result
+
+
+def profiles() -> np.ndarray:
+    """Brightness (2, 256) float32 across a fiber, from its middle to its edge in steps of q²: of its body and its highlight."""
+    cosine = np.sqrt(1 - (np.arange(_PROFILE) + 0.5) / _PROFILE)
+    return np.stack([0.35 + 0.65 * cosine, cosine**3]).astype(np.float32)
+
+
+def board(optics: Optics, shape: tuple[int, int], look: Look) -> np.ndarray:
+    """The blue board behind the hair (4, rows, columns), one plane a site of the mosaic: far out of focus, lit from above."""
+    planes = np.empty((4, *shape), np.float32)
+    for plane, (down, right, color) in zip(planes, _SITES, strict=True):
+        rows, columns = np.mgrid[: shape[0], : shape[1]]
+        u, v = geometry.to_image(columns + right / 2, rows + down / 2, optics.pitch_mm, optics.axis_col_px, optics.axis_row_px)
+        plane[:] = look.board[color] * (1 + 0.004 * v - 0.0015 * u - 0.0001 * (u * u + v * v))
+    return planes
+
+
+# ---- the photograph --------------------------------------------------------------------------------------------------
+
+_project = njit(geometry.project, inline="always")
+_to_pixel = njit(geometry.to_pixel, inline="always")
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Segments in the camera frame at one turntable angle, from top to bottom, so that drawing stays in the cache."""
+
+    ends: np.ndarray  # (S, 7) float32: u', v', w of both ends, radius; mm
+    strand: np.ndarray  # (S,) int32
+    colors: np.ndarray  # (S, 7) float32: R, G, B of both ends, share of the highlight
+
+
+def drawing(hair: Hair, angle_deg: float, shaded: Shade | None = None) -> Drawing:
+    """The hair turned by an angle, ready to be drawn; without ``shaded`` it is black."""
+    where = geometry.camera_points(hair.points_mm, angle_deg)
+    order = hair.segments[np.argsort(-where[hair.segments, 1], kind="stable")]
+    ends = np.column_stack([where[order], where[order + 1], hair.radius_mm[order]]).astype(np.float32)
+    colors = np.zeros((len(order), 7), np.float32)
+    if shaded is not None:
+        colors[:] = np.column_stack([shaded.color[order], shaded.color[order + 1], shaded.shine[order]])
+    return Drawing(ends, hair.fiber[order], colors)
+
+
+def photograph(hair: Drawing, background: np.ndarray, optics: Optics, focus_mm: float, lens: np.ndarray) -> np.ndarray:
+    """The light (4, rows, columns) float32 on the sites R, G, G, B of the mosaic's cells, without noise.
+
+    background (4, rows, columns) is what stands behind the hair; lens (n, 4) is from ``lens_points``. Plane R has its
+    pixel centres at integers, the others lie half a pixel to the right, below, or both.
+    """
+    planes = background.astype(np.float32)
+    _photograph(
+        hair.ends, hair.colors, planes, background, lens, focus_mm, optics.working_distance_mm, optics.pitch_mm,
+        optics.axis_col_px, optics.axis_row_px, profiles(),
+    )  # fmt: skip
+    return planes
+
+
+@njit(cache=True, nogil=True)
+def _draw(ends, lens_u, lens_v, focus, distance, pitch, axis_col, axis_row, depth, hit, at):
+    """Draw all segments as seen from one point of the lens: depth (w), index of the segment, and place on it.
+
+    The pixel (r, c) of the buffers looks along the ray through column c, row r of the plane of focus. ``at`` packs the
+    place along the segment (high byte) and q² across it (low byte). Bound by the pixels' read-compare-write.
+    """
+    depth[:] = -np.inf
+    hit[:] = _BARE
+    rows, columns = depth.shape
+    for k in range(len(ends)):
+        w0, w1, radius = ends[k, 2], ends[k, 5], ends[k, 6]
+        du0, dv0 = _project(ends[k, 0] - lens_u, ends[k, 1] - lens_v, w0, focus, distance)
+        du1, dv1 = _project(ends[k, 3] - lens_u, ends[k, 4] - lens_v, w1, focus, distance)
+        c0, r0 = _to_pixel(lens_u + du0, lens_v + dv0, pitch, axis_col, axis_row)
+        c1, r1 = _to_pixel(lens_u + du1, lens_v + dv1, pitch, axis_col, axis_row)
+        half = radius * distance / ((distance + focus - 0.5 * (w0 + w1)) * pitch)  # of its width, px
+        top, bottom = max(math.ceil(min(r0, r1) - half), 0), min(math.floor(max(r0, r1) + half), rows - 1)
+        if top > bottom or max(c0, c1) + half < 0 or min(c0, c1) - half > columns - 1:
+            continue
+        dc, dr = c1 - c0, r1 - r0
+        length = max(math.sqrt(dc * dc + dr * dr), 1e-3)
+        tc, tr = dc / length, dr / length
+        deep = (w1 - w0) / pitch
+        lean = length / math.sqrt(length * length + deep * deep)  # sine of the angle between fiber and view
+        bulge = radius / max(lean, 0.25)
+        more = 0.1 + half * math.sqrt(max(1 - lean * lean, 0.0))  # the rim of a cylinder that leans; 0.1 closes the joints
+        for r in range(top, bottom + 1):
+            y = r - r0
+            left, right = -1e9, 1e9
+            if abs(tr) > 1e-6:  # |across| < half, across = x tr - y tc
+                a, b = (y * tc - half) / tr, (y * tc + half) / tr
+                left, right = max(left, min(a, b)), min(right, max(a, b))
+            elif abs(y) > half:
+                continue
+            if abs(tc) > 1e-6:  # -more < along < length + more, along = x tc + y tr
+                a, b = (-more - y * tr) / tc, (length + more - y * tr) / tc
+                left, right = max(left, min(a, b)), min(right, max(a, b))
+            elif not -more < y * tr < length + more:
+                continue
+            first, last = max(math.ceil(left + c0), 0), min(math.floor(right + c0), columns - 1)
+            for c in range(first, last + 1):
+                x = c - c0
+                across = (x * tr - y * tc) / half
+                q = min(across * across, np.float32(0.999))
+                t = min(max((x * tc + y * tr) / length, 0.0), 1.0)
+                w = w0 + t * (w1 - w0) + bulge * math.sqrt(1 - q)
+                if w > depth[r, c]:
+                    depth[r, c] = w
+                    hit[r, c] = k
+                    at[r, c] = np.uint16(int(t * 255) * 256 + int(q * 256))
+
+
+@njit(cache=True, nogil=True)
+def _photograph(ends, colors, planes, background, lens, focus, distance, pitch, axis_col, axis_row, across):
+    """Add to planes (4, rows, columns), per point of the lens, what the hair there differs from the background."""
+    rows, columns = planes.shape[1:]
+    depth = np.empty((rows + 1, columns + 1), np.float32)
+    hit = np.empty((rows + 1, columns + 1), np.int32)
+    at = np.empty((rows + 1, columns + 1), np.uint16)
+    share = np.float32(1 / len(lens))
+    for i in range(len(lens)):
+        shift_c, shift_r = lens[i, 2], lens[i, 3]
+        _draw(ends, lens[i, 0], lens[i, 1], focus, distance, pitch, axis_col - shift_c, axis_row - shift_r, depth, hit, at)
+        # The ray of buffer pixel (r, c) meets the plane of focus at (r, c) + shift: within half a pixel of the red site of
+        # cell (r, c), and of the sites half a pixel further of cell (r, c), or of the one before, if the shift is negative.
+        before_r, before_c = int(shift_r < 0), int(shift_c < 0)
+        for r in range(rows + 1):
+            for c in range(columns + 1):
+                k = hit[r, c]
+                if k == _BARE:
+                    continue
+                t = np.float32(at[r, c] >> 8) / np.float32(255)
+                q = at[r, c] & 255
+                shine = colors[k, 6]
+                bright = share * ((1 - shine) * across[0, q] + shine * across[1, q])
+                green = bright * (colors[k, 1] + t * (colors[k, 4] - colors[k, 1]))
+                r1, c1 = r - before_r, c - before_c
+                if r < rows and c < columns:
+                    planes[0, r, c] += bright * (colors[k, 0] + t * (colors[k, 3] - colors[k, 0])) - share * background[0, r, c]
+                if r < rows and 0 <= c1 < columns:
+                    planes[1, r, c1] += green - share * background[1, r, c1]
+                if 0 <= r1 < rows and c < columns:
+                    planes[2, r1, c] += green - share * background[2, r1, c]
+                if 0 <= r1 < rows and 0 <= c1 < columns:
+                    planes[3, r1, c1] += bright * (colors[k, 2] + t * (colors[k, 5] - colors[k, 2])) - share * background[3, r1, c1]
+
+
+def expose(planes: np.ndarray, full_well_e: float, read_noise_e: float, rng) -> np.ndarray:
+    """The mosaic (2H, 2W) uint16, RGGB, that a sensor makes of light (4, H, W), 1 at white: shot noise, read noise, 14 bit."""
+    electrons = np.maximum(planes, 0) * np.float32(full_well_e)
+    noisy = electrons + np.sqrt(electrons + np.float32(read_noise_e**2)) * rng.standard_normal(planes.shape, np.float32)
+    numbers = np.rint(BLACK + noisy * np.float32((WHITE - BLACK) / full_well_e)).clip(0, WHITE).astype(np.uint16)
+    mosaic = np.empty((2 * planes.shape[1], 2 * planes.shape[2]), np.uint16)
+    for plane, (down, right, _) in zip(numbers, _SITES, strict=True):
+        mosaic[down::2, right::2] = plane
+    return mosaic
+
+
+# ---- truth -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Points each 0.1 mm along the fibers, inside the volume that every sweep sees."""
+
+    points_mm: np.ndarray  # (K, 3) float64, object frame
+    tangents: np.ndarray  # (K, 3) unit
+    strand: np.ndarray  # (K,) int32
+
+
+def samples(groom: Groom, radius_mm: float, half_height_mm: float, step_mm: float = 0.1) -> Samples:
+    """Points inside the cylinder about the y axis that is inside the image and the sweep's range at every angle."""
+    points, tangents, strands = [], [], []
+    for i in range(len(groom)):
+        curve = groom[i]
+        s = np.r_[0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))]
+        at = np.arange(step_mm / 2, s[-1], step_mm)
+        place = np.stack([np.interp(at, s, x) for x in curve.T], axis=-1)
+        along = np.stack([np.interp(at, s, x) for x in np.gradient(curve, s, axis=0).T], axis=-1)
+        inside = (np.hypot(place[:, 0], place[:, 2]) <= radius_mm) & (np.abs(place[:, 1]) <= half_height_mm)
+        points.append(place[inside])
+        tangents.append(along[inside] / np.linalg.norm(along[inside], axis=1, keepdims=True))
+        strands.append(np.full(inside.sum(), i, np.int32))
+    return Samples(np.concatenate(points), np.concatenate(tangents), np.concatenate(strands))
+
+
+def visibility(hair: Hair, at: Samples, optics: Optics, angle_deg: float, rays: int = 32, slab_mm: float = 1.0) -> np.ndarray:
+    """Fraction (K,) of the aperture's rays that reach each sample, in focus, unoccluded by other fibers.
+
+    For each slab of depths the hair is drawn from points of the lens at twice the resolution of the photographs, which
+    tells what stands before each sample. A fiber hides itself only where it comes back in front, as a curl does.
+    """
+    where = geometry.camera_points(at.points_mm, angle_deg)
+    seen = np.zeros(len(where))
+    if not len(where):
+        return seen
+    drawn = drawing(hair, angle_deg)
+    lens = lens_points(rays, aperture_radius_mm(optics), np.random.default_rng(0))
+    pitch = optics.pitch_mm / 2
+    slab = np.floor(where[:, 2] / slab_mm)
+    for level in np.unique(slab):
+        chosen = np.flatnonzero(slab == level)
+        points = where[chosen]
+        low, high = points[:, :2].min(axis=0) - 0.5, points[:, :2].max(axis=0) + 0.5
+        shape = tuple(np.ceil((high - low)[::-1] / pitch).astype(int) + 1)
+        axis_col, axis_row = -low[0] / pitch, high[1] / pitch
+        focus = (level + 0.5) * slab_mm
+        seen[chosen] = _visible(
+            drawn.ends, drawn.strand, lens, points, at.strand[chosen], focus, optics.working_distance_mm, pitch, axis_col, axis_row, shape
+        )
+    return seen
+
+
+@njit(cache=True, nogil=True)
+def _visible(ends, strand, lens, points, own, focus, distance, pitch, axis_col, axis_row, shape):
+    """Fraction (K,) of points of the lens from which points (K, 3) of the camera frame on strands own (K,) are seen."""
+    depth, hit, at = np.empty(shape, np.float32), np.empty(shape, np.int32), np.empty(shape, np.uint16)
+    count = np.zeros(len(points))
+    for i in range(len(lens)):
+        _draw(ends, lens[i, 0], lens[i, 1], focus, distance, pitch, axis_col - lens[i, 2], axis_row - lens[i, 3], depth, hit, at)
+        for k in range(len(points)):
+            w = points[k, 2]
+            u, v = _project(points[k, 0] - lens[i, 0], points[k, 1] - lens[i, 1], w, focus, distance)
+            c, r = _to_pixel(lens[i, 0] + u, lens[i, 1] + v, pitch, axis_col - lens[i, 2], axis_row - lens[i, 3])
+            r, c = round(r), round(c)
+            found = hit[r, c]
+            nearer = depth[r, c] - w
+            itself = found == _BARE or (strand[found] == own[k] and nearer < 0.5)
+            count[k] += 1.0 if itself or nearer <= 0 else 0.0
+    return count / len(lens)
+
+
+# ---- a whole capture -------------------------------------------------------------------------------------------------
+
+
+def plan(out: Path, params: SimulateParams) -> Capture:
+    """The capture that ``params`` will give, before a photograph is taken. Raises StrandscopeError for a wrong parameter."""
+    if params.scale not in SCALES:
+        raise StrandscopeError(f"scale is {params.scale!r}; expected one of {', '.join(SCALES)}")
+    if params.style not in STYLES:
+        raise StrandscopeError(f"style is {params.style!r}; expected one of {', '.join(STYLES)}")
+    if params.fibers is not None and params.fibers < 1:
+        raise StrandscopeError(f"fibers is {params.fibers}; expected 1 or more")
+    scale = SCALES[params.scale]
+    optics = Optics(params.working_distance_mm, params.pitch_mm, (scale.columns - 1) / 2, (scale.rows - 1) / 2, params.aperture_cone_deg)
+    count = 2 * int(scale.half_range_mm / params.step_mm + 1e-6) + 1
+    positions = tuple(round((i - count // 2) * params.step_mm, 6) for i in range(count))
+    angles = np.arange(scale.angles) * 360 / scale.angles
+    sweeps = tuple(Sweep(float(angle), positions, tuple(f"sweep_{i:03d}/img_{j:04d}.dng" for j in range(count))) for i, angle in enumerate(angles))
+    turns = tuple(float(i * 360 / scale.turntable) for i in range(scale.turntable))
+    turntable = Turntable(params.turntable_f_number, tuple(f"turntable/img_{i:03d}.dng" for i in range(scale.turntable)), turns, 0.0)
+    fibers = params.fibers or scale.fibers
+    return Capture(Path(out), f"simulated {params.style} hair, {fibers} fibers, seed {params.seed}", optics, sweeps, turntable, "truth.npz")
+
+
+def simulate(out: Path, params: SimulateParams, progress: Progress = silent, workers: int = 0) -> Capture:
+    """Photograph known hair: a capture in the folder ``out``, with its truth. Returns it as it was read back.
+
+    A run that was interrupted goes on where it stopped; ``capture.json`` is written last. ``workers`` threads (0: one a
+    core) do not change a byte. Raises StrandscopeError where ``out`` holds something else, or a parameter is wrong.
+    """
+    out = Path(out)
+    capture = plan(out, params)
+    if _begin(out, params):
+        return load_capture(out)
+    scale = SCALES[params.scale]
+    progress("groom", 0, 1)
+    lock = groom(lock_params(params), np.random.default_rng([params.seed, 0]))
+    progress("groom", 1, 1)
+    hair = prepare(lock, np.random.default_rng([params.seed, 1]))
+    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+        _photographs(capture, hair, params, progress, pool)
+        if not capture.truth_path.is_file():
+            _write_truth(capture, lock, hair, scale, progress, pool)
+    save_capture(replace(capture, unknown={"simulation": asdict(params)}))
+    return load_capture(out)
+
+
+def lock_params(params: SimulateParams) -> GroomParams:
+    """The lock that fits the scale: it goes on above and below the image, as far as blurred hair is seen."""
+    scale = SCALES[params.scale]
+    half_height = scale.rows / 2 * params.pitch_mm
+    beyond = 1.5 + 0.25 * scale.lock_radius_mm + 0.1 * half_height
+    return GroomParams(params.style, params.fibers or scale.fibers, scale.lock_radius_mm, half_height + beyond)
+
+
+def _begin(out: Path, params: SimulateParams) -> bool:
+    """Make the folder ready; true if the capture is already there. Raises StrandscopeError where it holds something else."""
+    journal = out / JOURNAL
+    asked = {"revision": REVISION, **asdict(params)}
+    try:
+        if out.exists() and not out.is_dir():
+            raise StrandscopeError(f"{out}: is a file; expected a new or empty folder for the capture")
+        if not out.is_dir() or not any(out.iterdir()):
+            with atomic(journal) as part:
+                part.write_text(json.dumps(asked, indent=1), encoding="utf-8")
+            return False
+        if not journal.is_file():
+            raise StrandscopeError(f"{out}: holds files that no simulation made; expected a new or empty folder for the capture")
+        found = json.loads(journal.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise explain(error, out) from error
+    except ValueError as error:
+        raise StrandscopeError(f"{journal}: not valid JSON ({error}); expected the parameters of a simulation") from error
+    for name, value in asked.items():
+        if not isinstance(found, dict) or found.get(name, "missing") != value:
+            was = found.get(name, "missing") if isinstance(found, dict) else found
+            raise StrandscopeError(f"{out}: holds a simulation with {name} {was}, not {value}; expected the same parameters, or another folder")
+    for left in out.rglob(".*.part*"):  # of a run that was killed
+        left.unlink(missing_ok=True)
+    return (out / FILE_NAME).is_file()
+
+
+def _photographs(capture: Capture, hair: Hair, params: SimulateParams, progress: Progress, pool: ThreadPoolExecutor) -> None:
+    """Take all photographs that are not there yet."""
+    scale, optics, look = SCALES[params.scale], capture.optics, LOOKS[params.style]
+    background = board(optics, (scale.rows, scale.columns), look)
+    fog = density(hair)
+    gain = _gain(hair, fog, look, params)
+    reach = float(np.hypot(hair.points_mm[:, 0], hair.points_mm[:, 2]).max())
+    stopped = replace(optics, aperture_cone_deg=stopped_cone_deg(params))
+    sequences = [(s.angle_deg, d, f, optics) for s in capture.sweeps for d, f in zip(s.positions_mm, s.files, strict=True)]
+    sequences += [(a, capture.turntable.focus_mm, f, stopped) for a, f in zip(capture.turntable.angles_deg, capture.turntable.files, strict=True)]
+    by_angle: dict[float, list] = {}
+    for number, (angle, focus, file, through) in enumerate(sequences):
+        by_angle.setdefault(angle, []).append((number, focus, file, through))
+    done = 0
+    for angle, shots in by_angle.items():
+        missing = [shot for shot in shots if not (capture.folder / shot[2]).is_file()]
+        done += len(shots) - len(missing)
+        if not missing:
+            continue
+        shaded = shade(hair, fog, look, angle, optics.working_distance_mm)
+        drawn = drawing(hair, angle, replace(shaded, color=shaded.color * np.float32(gain)))
+
+        def take(shot, drawn=drawn):
+            number, focus, file, through = shot
+            rng = np.random.default_rng([params.seed, 2, number])
+            lens = lens_points(lens_count(through, reach + abs(focus)), aperture_radius_mm(through), rng)
+            planes = photograph(drawn, background, through, focus, lens)
+            write_dng(capture.folder / file, expose(planes, params.full_well_e, params.read_noise_e, rng), BLACK, WHITE)
+
+        for _ in _each(pool, take, missing):
+            done += 1
+            progress("photographs", done, len(sequences))
+
+
+def _each(pool: ThreadPoolExecutor, work, items):
+    """Results of ``work(item)`` as they come; what was not begun is dropped when one fails or the caller gives up."""
+    futures = [pool.submit(work, item) for item in items]
+    try:
+        for future in as_completed(futures):
+            yield future.result()
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def stopped_cone_deg(params: SimulateParams) -> float:
+    """Full angle of the cone at the f-number of the turntable sequence; the radius of the aperture goes with 1 / f-number."""
+    tangent = math.tan(math.radians(params.aperture_cone_deg) / 2) * params.open_f_number / params.turntable_f_number
+    return math.degrees(2 * math.atan(tangent))
+
+
+def _gain(hair: Hair, fog: Density, look: Look, params: SimulateParams) -> float:
+    """The exposure: the brightest hundredth of the hair, seen from four sides, comes to ``params.exposure`` in red."""
+    shades = [shade(hair, fog, look, angle, params.working_distance_mm).color[:, 0] for angle in (0.0, 90.0, 180.0, 270.0)]
+    return params.exposure / float(np.percentile(np.concatenate(shades), 99))
+
+
+def _write_truth(capture: Capture, lock: Groom, hair: Hair, scale: Scale, progress: Progress, pool: ThreadPoolExecutor) -> None:
+    """truth.npz: the fibers, samples of them inside the captured volume, and how much of the aperture sees each."""
+    pitch, margin = capture.optics.pitch_mm, 0.1
+    radius = min((scale.columns - 1) / 2 * pitch, scale.half_range_mm) - margin
+    at = samples(lock, radius, (scale.rows - 1) / 2 * pitch - margin)
+    seen = np.zeros((len(at.points_mm), len(capture.sweeps)), np.float16)
+
+    def look(k):
+        seen[:, k] = visibility(hair, at, capture.optics, capture.sweeps[k].angle_deg)
+
+    for done, _ in enumerate(_each(pool, look, range(len(capture.sweeps)))):
+        progress("truth", done + 1, len(capture.sweeps))
+    arrays = {
+        "points": lock.points_mm.astype(np.float32),
+        "offsets": lock.offsets.astype(np.int64),
+        "radii": lock.radii_mm.astype(np.float32),
+        "sample_points": at.points_mm.astype(np.float32),
+        "sample_tangents": at.tangents.astype(np.float32),
+        "sample_strand": at.strand,
+        "visibility": seen,
+    }
+    with atomic(capture.truth_path) as part:
+        np.savez_compressed(part, **arrays)
