@@ -24,7 +24,10 @@ _ATTRIBUTES = {
     "confidence": ("FLOAT", "POINT", "value", np.float32),
     "strand_id": ("INT", "CURVE", "value", np.int32),
     "kind": ("INT8", "CURVE", "value", np.int8),
+    "stop_start": ("INT8", "CURVE", "value", np.int8),
+    "stop_end": ("INT8", "CURVE", "value", np.int8),
 }
+_STOPS = ("stop_start", "stop_end")  # why either end stopped growing, where that is known
 
 
 def to_blender(points_mm: np.ndarray) -> np.ndarray:
@@ -51,14 +54,17 @@ def add_hair(strands: Strands, name: str = "Hair", collection: bpy.types.Collect
     curves = bpy.data.hair_curves.new(name)
     curves.add_curves(np.diff(strands.offsets).tolist())
     curves.set_types(type="POLY")
-    for attribute, values in {
+    values = {
         "position": to_blender(strands.points_mm),
         "radius": METRES_PER_MM * strands.radius_mm.astype(np.float64),
         "confidence": strands.confidence,
         "strand_id": np.arange(len(strands)),
         "kind": strands.kind,
-    }.items():
-        _write(curves, attribute, values)
+    }
+    if strands.stops is not None:
+        values |= dict(zip(_STOPS, strands.stops.T, strict=True))
+    for attribute, each in values.items():
+        _write(curves, attribute, each)
     curves[PROVENANCE] = json.dumps(strands.provenance, sort_keys=True)
     curves[STATISTICS] = json.dumps(statistics(strands))
     hair = bpy.data.objects.new(name, curves)
@@ -83,6 +89,7 @@ def strands_of(hair: bpy.types.Object) -> Strands:
         radius_mm=(_read(curves, "radius", 4e-5).astype(np.float64) / METRES_PER_MM).astype(np.float32),
         kind=_read(curves, "kind", CAPTURED).astype(np.uint8),
         confidence=_read(curves, "confidence", 1),
+        stops=np.stack([_read(curves, name) for name in _STOPS], axis=1).astype(np.uint8) if _STOPS[0] in curves.attributes else None,
         provenance=json.loads(curves.get(PROVENANCE, "{}")),
     )
 

@@ -25,7 +25,7 @@ from ..core.strands import Strands, load_strands
 from . import hair as hair_module
 from . import material, rig_scene
 
-MACRO_LENS_MM = 100.0  # focal length that turns the turntable's f-number into a cone of rays
+SWEEP_F_NUMBER = 2.8  # at which sweeps are taken, with the cone of rays that the capture tells (sec. 3)
 FRAMES_VERSION = 1  # of what a frame shows; a change renders existing frames again
 PROGRESS_STAGE = "rendering"
 
@@ -46,7 +46,7 @@ def shots(capture: Capture, count: int) -> list[Shot]:
     where it has none, of each sweep the one with its plane of focus nearest to the axis."""
     table, optics = capture.turntable, capture.optics
     if table:
-        cone_deg = 2 * math.degrees(math.atan(MACRO_LENS_MM / table.f_number / (2 * optics.working_distance_mm)))
+        cone_deg = 2 * math.degrees(math.atan(math.tan(math.radians(optics.aperture_cone_deg / 2)) * SWEEP_F_NUMBER / table.f_number))
         found = [
             Shot(file, angle, table.focus_mm, cone_deg, f"f/{table.f_number:g}") for file, angle in zip(table.files, table.angles_deg, strict=True)
         ]

@@ -45,6 +45,7 @@ def strands() -> Strands:
         radius_mm=rng.uniform(0.02, 0.06, count).astype(np.float32),
         kind=np.where(np.arange(9) % 3 == 2, INFILL, CAPTURED).astype(np.uint8),
         confidence=rng.uniform(0, 1, count).astype(np.float32),
+        stops=rng.integers(0, 6, (9, 2)).astype(np.uint8),
         provenance={"capture": "a test", "parameters": {"step_mm": 0.1}},
     )
 

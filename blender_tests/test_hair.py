@@ -1,5 +1,7 @@
 """Strands <-> Blender: the transform by hand, the round trip, what is shown."""
 
+import dataclasses
+
 import bpy
 import numpy as np
 import pytest
@@ -23,12 +25,16 @@ def test_transform_keeps_hands():
 
 def test_round_trip(strands):
     back = hair.strands_of(hair.add_hair(strands))
-    for name in ("offsets", "kind", "confidence"):
+    for name in ("offsets", "kind", "confidence", "stops"):
         np.testing.assert_array_equal(getattr(back, name), getattr(strands, name))
         assert getattr(back, name).dtype == getattr(strands, name).dtype
     np.testing.assert_array_max_ulp(back.points_mm, strands.points_mm, maxulp=1)
     np.testing.assert_array_max_ulp(back.radius_mm, strands.radius_mm, maxulp=1)
     assert back.provenance == strands.provenance
+
+
+def test_round_trip_of_strands_that_do_not_say_why_they_stopped(strands):
+    assert hair.strands_of(hair.add_hair(dataclasses.replace(strands, stops=None))).stops is None
 
 
 def test_attributes(strands):
