@@ -70,7 +70,7 @@ def write_pairs(pairs: list[tuple[np.ndarray, np.ndarray]], captions: list[tuple
     from PIL import Image, ImageDraw, ImageFont
 
     height, width = pairs[0][0].shape[:2]
-    across = max(1, round(math.sqrt(len(pairs) * height / (2 * width))))
+    across = max(1, math.ceil(math.sqrt(len(pairs) * height / (2 * width))))
     rows = -(-len(pairs) // across)
     cell_w, cell_h = 2 * (width + GAP_PX) + 3 * GAP_PX, height + CAPTION_PX + GAP_PX
     picture = Image.new("RGB", (across * cell_w - 4 * GAP_PX, rows * cell_h), PAPER)

@@ -33,6 +33,8 @@ def _frame_selected(context) -> None:
         if area.type == "VIEW_3D" and region:
             with context.temp_override(area=area, region=region):
                 bpy.ops.view3d.view_selected()
+            space = area.spaces.active
+            space.clip_start = min(space.clip_start, space.region_3d.view_distance / 20)
             return
 
 
