@@ -341,9 +341,7 @@ def import_(
 @click.option("--infill", type=click.IntRange(0), metavar="N", help="Number of hairs to add inside, where no camera sees.")
 @click.option("--no-infill", is_flag=True, help="Captured hairs only.")
 @click.option("--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given.")
-@click.option(
-    "--memory", type=Memory(), default="6GB", show_default=True, help="Memory to use at most; a capture that needs more is refused."
-)
+@click.option("--memory", type=Memory(), default="6GB", show_default=True, help="Memory to use at most; a capture that needs more is refused.")
 @common
 @click.pass_obj
 def reconstruct(session, capture, output, preset, params, method, infill, no_infill, workers, memory):

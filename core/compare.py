@@ -13,7 +13,7 @@ from .capture import Capture
 from .errors import StrandscopeError, StrandsError
 from .files import atomic
 from .geometry import Optics, camera_points, project, to_pixel
-from .ridges import RidgeParams, response
+from .ridges import RidgeParams, estimate, response
 from .strands import INFILL, Strands, load_arrays, offsets_of
 
 SAMPLE_MM = 0.1  # spacing at which reconstructed length is judged
@@ -351,10 +351,10 @@ def in_focus(capture: Capture, strands: Strands, shot: Shot) -> tuple[np.ndarray
     return np.stack([pixel[:-1][keep], pixel[1:][keep]], axis=1), curve[:-1][keep]
 
 
-def overlay(capture: Capture, strands: Strands, shot: Shot, out: Path, ridges: RidgeParams, color_by: str = "strand") -> str:
+def overlay(capture: Capture, strands: Strands, shot: Shot, out: Path, color_by: str = "strand") -> str:
     """Write a picture (.png): a photograph, its ridges, and the curves in focus drawn over it, side by side.
 
-    color_by: "strand" gives each curve a colour of its own; "kind" tells captured from infill. Returns the caption.
+    The ridges are those that the strands were grown from, if their provenance tells. color_by: "strand" gives each curve a colour of its own; "kind" tells captured from infill. Returns the caption.
     Raises CaptureError for a photograph that cannot be read, StrandscopeError for a picture that cannot be written.
     """
     from PIL import Image
@@ -369,7 +369,7 @@ def overlay(capture: Capture, strands: Strands, shot: Shot, out: Path, ridges: R
     caption = f"{file}: sweep {shot.sweep} at {sweep.angle_deg:g}°, d = {sweep.positions_mm[shot.photograph]:g} mm"
     count = f"{len(np.unique(curve))} of {len(strands)} curves in focus (within {depth_of_field_mm(capture.optics):.1f} mm)"
     photograph = _enlarge(_developed(planes), zoom)
-    crests = response(planes[0], ridges)
+    crests = response(planes[0], _ridge_params(strands, planes[0]))
     shown = (255 * np.sqrt(np.clip(crests / max(float(np.percentile(crests[crests > 0], 99)) if (crests > 0).any() else 1.0, 1e-6), 0, 1))).astype(
         np.uint8
     )
@@ -384,6 +384,14 @@ def overlay(capture: Capture, strands: Strands, shot: Shot, out: Path, ridges: R
     with atomic(out) as part:
         picture.save(part)
     return f"{caption}; {count}"
+
+
+def _ridge_params(strands: Strands, plane: np.ndarray) -> RidgeParams:
+    """The parameters of the ridges that strands were grown from, else the usual ones for a plane."""
+    try:
+        return RidgeParams(**strands.provenance["parameters"]["ridges"])
+    except (KeyError, TypeError):
+        return estimate([plane], RidgeParams())
 
 
 def _developed(planes: np.ndarray) -> np.ndarray:
