@@ -381,10 +381,9 @@ def reconstruct(session, capture, output, preset, params, method, infill, no_inf
     show_default=True,
     help="Each curve in a colour of its own, or captured hairs and infill told apart.",
 )
-@click.option("--operator", type=click.Choice(["paper", "oriented"]), default="oriented", show_default=True, help="The ridge filter to show.")
 @common
 @click.pass_obj
-def overlay(session, capture, strands, output, sweep, angle, position, color, operator):
+def overlay(session, capture, strands, output, sweep, angle, position, color):
     """Draw the curves of a strands file back onto a photograph of CAPTURE, to see whether they lie on the hairs.
 
     The picture shows the photograph, the ridges that were found in it, and the curves over the photograph. Only the parts of
@@ -396,14 +395,13 @@ def overlay(session, capture, strands, output, sweep, angle, position, color, op
     """
     from . import compare
     from .capture import load_capture
-    from .ridges import RidgeParams
     from .strands import load_strands
 
     if sweep is not None and angle is not None:
         raise click.UsageError("--sweep and --angle exclude each other")
     photographs, curves = load_capture(capture), load_strands(strands)
     shot = compare.choose_shot(photographs, curves, sweep, angle, position)
-    session.report.show(compare.overlay(photographs, curves, shot, output, RidgeParams(operator=operator), color))
+    session.report.show(compare.overlay(photographs, curves, shot, output, color))
     session.report.done(output)
 
 

@@ -354,8 +354,9 @@ def in_focus(capture: Capture, strands: Strands, shot: Shot) -> tuple[np.ndarray
 def overlay(capture: Capture, strands: Strands, shot: Shot, out: Path, color_by: str = "strand") -> str:
     """Write a picture (.png): a photograph, its ridges, and the curves in focus drawn over it, side by side.
 
-    The ridges are those that the strands were grown from, if their provenance tells. color_by: "strand" gives each curve a colour of its own; "kind" tells captured from infill. Returns the caption.
-    Raises CaptureError for a photograph that cannot be read, StrandscopeError for a picture that cannot be written.
+    The ridges are those that the strands were grown from, if their provenance tells. color_by: "strand" gives each curve a
+    colour of its own; "kind" tells captured from infill. Returns the caption. Raises CaptureError for a photograph that
+    cannot be read, StrandscopeError for a picture that cannot be written.
     """
     from PIL import Image
 

@@ -8,7 +8,6 @@ from strandscope.core.capture import load_capture
 from strandscope.core.compare import Shot, Truth, choose_shot, depth_of_field_mm, in_focus, load_truth, overlay, score, summary
 from strandscope.core.errors import StrandscopeError, StrandsError
 from strandscope.core.geometry import Optics, pixels
-from strandscope.core.ridges import RidgeParams
 from strandscope.core.strands import INFILL, Strands, offsets_of
 
 ANGLES = 24
@@ -183,7 +182,7 @@ def test_the_photograph_with_most_hair_in_focus_is_chosen(noise_capture):
 
 def test_the_picture_shows_three_panels_with_the_curve_in_the_third(noise_capture, tmp_path):
     capture = load_capture(noise_capture)
-    caption = overlay(capture, strands_of([vertical(0.3, 0.0)]), Shot(0, 2), tmp_path / "o.png", RidgeParams())
+    caption = overlay(capture, strands_of([vertical(0.3, 0.0)]), Shot(0, 2), tmp_path / "o.png")
     assert "1 of 1 curves" in caption
     picture = np.asarray(Image.open(tmp_path / "o.png")).astype(int)
     zoom = 14  # 64 pixels wide -> at least 840
@@ -199,5 +198,5 @@ def test_the_picture_shows_three_panels_with_the_curve_in_the_third(noise_captur
 
 def test_a_picture_needs_a_name_that_says_png(noise_capture, tmp_path):
     with pytest.raises(StrandscopeError, match=r"\.png"):
-        overlay(load_capture(noise_capture), strands_of([]), Shot(0, 0), tmp_path / "o.gif", RidgeParams())
+        overlay(load_capture(noise_capture), strands_of([]), Shot(0, 0), tmp_path / "o.gif")
     assert not (tmp_path / "o.gif").exists()
