@@ -15,6 +15,7 @@ from ..core.strands import CAPTURED, Strands, statistics
 
 METRES_PER_MM = 0.001
 PROVENANCE, STATISTICS = "strandscope_provenance", "strandscope_statistics"  # custom properties of the curves, JSON
+CYCLES_RADIUS = 3e-4  # in units of the scene
 SHOW = "Strandscope Show"  # modifier and node group that hide captured hair or infill
 
 # name -> (type, domain, property, dtype) of what an attribute holds
@@ -111,6 +112,13 @@ def describe(hair: bpy.types.Object) -> str:
         f"{numbers['mean_curves_crossing_a_horizontal_plane']:.0f} side by side, {2 * numbers['mean_radius_mm']:.3f} mm thick",
     ]
     return "\n".join(lines)
+
+
+def is_small_for_cycles(hair: bpy.types.Object) -> bool:
+    """Whether Cycles would shade this hair wrongly, since it is so thin in units of the scene (see ``rig_scene``)."""
+    numbers = json.loads(hair.data.get(STATISTICS, "{}"))
+    scale = hair.matrix_world.to_scale()[0]
+    return 0 < numbers.get("mean_radius_mm", 0) * METRES_PER_MM * scale < CYCLES_RADIUS
 
 
 def switches(hair: bpy.types.Object):

@@ -88,6 +88,10 @@ class STRANDSCOPE_PT_hair(_Tab, bpy.types.Panel):
             row = layout.row(align=True)
             for name, switch in zip(("Captured", "Infill"), inputs, strict=True):
                 row.prop(switch, "value", text=name, toggle=True)
+        if context.scene.render.engine == "CYCLES" and hair.is_small_for_cycles(active):
+            column = layout.column(align=True)
+            _text(column, context, "Too thin for Cycles at this scale", icon="INFO")
+            column.operator("strandscope.enlarge", icon="FULLSCREEN_ENTER")
 
 
 class STRANDSCOPE_PT_compare(_Tab, bpy.types.Panel):

@@ -26,7 +26,7 @@ from . import hair as hair_module
 from . import material, rig_scene
 
 SWEEP_F_NUMBER = 2.8  # at which sweeps are taken, with the cone of rays that the capture tells (sec. 3)
-FRAMES_VERSION = 1  # of what a frame shows; a change renders existing frames again
+FRAMES_VERSION = 2  # of what a frame shows; a change renders existing frames again
 PROGRESS_STAGE = "rendering"
 
 
@@ -142,7 +142,8 @@ def _name(strands: Strands) -> str:
 
 def _look_at(strands: Strands) -> None:
     """Every 3D viewport of the file looks at the hair from the front, slightly above, in material colours; the first with its sidebar open."""
-    low, high = (hair_module.to_blender(corner(strands.points_mm, axis=0)) for corner in (np.min, np.max))
+    larger = rig_scene.UNITS_PER_MM / hair_module.METRES_PER_MM
+    low, high = (larger * hair_module.to_blender(corner(strands.points_mm, axis=0)) for corner in (np.min, np.max))
     centre, size = Vector(((low + high) / 2).tolist()), float(np.linalg.norm(high - low))
     for screen in bpy.data.screens:
         for area in screen.areas:
@@ -190,7 +191,7 @@ def _render(strands, view, chosen, frames, resolution, samples, melanin, progres
         scene = bpy.data.scenes.new("Strandscope turntable")
         hair = hair_module.add_hair(strands, "Hair", scene.collection)
         hair.data.materials.append(material.hair_material(melanin))
-        rig = rig_scene.build(scene, hair, view, rig_scene.RENDER_UNITS_PER_MM, chosen[0].cone_deg)
+        rig = rig_scene.build(scene, hair, view, cone_deg=chosen[0].cone_deg)
         rig.board.hide_render = True
         _prepare(scene, resolution, samples)
         for i in missing:

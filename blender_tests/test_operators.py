@@ -54,6 +54,17 @@ def test_import_strands(strands, strands_file):
     assert hair.describe(new).startswith("6 captured, 3 infill")
 
 
+def test_hair_can_be_enlarged_for_cycles(strands_file):
+    bpy.ops.strandscope.import_strands(filepath=str(strands_file))
+    new = bpy.context.object
+    assert hair.is_small_for_cycles(new)
+    points = hair.strands_of(new).points_mm
+    bpy.ops.strandscope.enlarge()
+    bpy.context.view_layer.update()
+    assert not hair.is_small_for_cycles(new)
+    assert (hair.strands_of(new).points_mm == points).all()  # the data stay in real size
+
+
 def test_import_of_damaged_strands_is_an_error(tmp_path):
     (tmp_path / "bad.npz").write_bytes(b"PK no zip")
     with pytest.raises(RuntimeError, match=r"bad\.npz"):

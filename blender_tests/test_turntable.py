@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from strandscope.addon import hair, turntable
+from strandscope.addon import hair, rig_scene, turntable
 from strandscope.core.capture import Turntable
 from strandscope.core.errors import StrandscopeError, StrandsError
 
@@ -25,6 +25,8 @@ def test_blend_holds_the_hair_and_nothing_else(tmp_path, strands, strands_file, 
     np.testing.assert_array_max_ulp(hair.strands_of(found).points_mm, strands.points_mm, maxulp=1)
     assert found.parent == bpy.data.objects["Turntable"]
     scene = bpy.context.scene
+    shown_mm = np.array(found.dimensions) * scene.unit_settings.scale_length * 1000
+    np.testing.assert_allclose(shown_mm[2], np.ptp(strands.points_mm[:, 1]), rtol=0.2)  # with the hair's radius
     assert scene.camera == bpy.data.objects["Camera"]
     assert (scene.render.resolution_x, scene.render.resolution_y) == (32, 24)
     assert (scene.render.engine, scene.view_settings.view_transform) == ("CYCLES", "Standard")
@@ -34,7 +36,7 @@ def test_blend_holds_the_hair_and_nothing_else(tmp_path, strands, strands_file, 
 def test_blend_has_the_hair_in_view(tmp_path, strands, strands_file):
     bpy.ops.wm.open_mainfile(filepath=str(turntable.blend(strands_file, tmp_path / "hair.blend")))
     space = next(a.spaces.active for a in bpy.data.screens["Layout"].areas if a.type == "VIEW_3D")
-    extent = np.linalg.norm(np.ptp(hair.to_blender(strands.points_mm), axis=0))
+    extent = np.linalg.norm(np.ptp(strands.points_mm, axis=0)) * rig_scene.UNITS_PER_MM
     assert extent < space.region_3d.view_distance < 3 * extent
     assert space.clip_start < extent / 10
     assert space.show_region_ui

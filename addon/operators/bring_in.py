@@ -15,6 +15,8 @@ from .. import hair, material
 def show_strands(context, strands: Strands, name: str) -> bpy.types.Object:
     """Strands as a new hair object with its material, active and selected, and in view."""
     new = hair.add_hair(strands, name, context.collection)
+    if len(bpy.data.hair_curves) == 1:  # the first hair of a file is shown as thick as it is, not as lines
+        context.scene.render.hair_type = "STRIP"
     new.data.materials.append(bpy.data.materials.get(material.NAME) or material.hair_material())
     if context.object and context.object.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
@@ -89,6 +91,23 @@ class STRANDSCOPE_OT_import_strands(bpy.types.Operator, ImportHelper):
         return super().invoke(context, event)
 
 
+class STRANDSCOPE_OT_enlarge(bpy.types.Operator):
+    """Show this hair 10 times larger, by its scale. Where one unit is a metre, Cycles cannot shade anything as thin as hair"""
+
+    bl_idname = "strandscope.enlarge"
+    bl_label = "Enlarge 10 Times"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        cls.poll_message_set("Select hair that Strandscope made")
+        return hair.is_hair(context.object)
+
+    def execute(self, context):
+        context.object.scale = [10 * factor for factor in context.object.scale]
+        return {"FINISHED"}
+
+
 class STRANDSCOPE_FH_strands(bpy.types.FileHandler):
     """Strands files dropped onto a 3D viewport"""
 
@@ -107,4 +126,4 @@ def menu(self, _context):
     self.layout.operator(STRANDSCOPE_OT_import_capture.bl_idname, text=f"Strandscope Capture ({FILE_NAME})")
 
 
-CLASSES = (STRANDSCOPE_OT_import_capture, STRANDSCOPE_OT_import_strands, STRANDSCOPE_FH_strands)
+CLASSES = (STRANDSCOPE_OT_import_capture, STRANDSCOPE_OT_import_strands, STRANDSCOPE_OT_enlarge, STRANDSCOPE_FH_strands)
