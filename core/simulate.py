@@ -23,7 +23,7 @@ from .capture import FILE_NAME, Capture, Sweep, Turntable, load_capture, save_ca
 from .errors import StrandscopeError
 from .files import atomic, explain
 from .geometry import Optics
-from .groom import STYLES, Groom, GroomParams, groom
+from .groom import STYLES, Groom, GroomParams, curvature, groom
 from .progress import Progress, silent
 from .raw import write_dng
 
@@ -49,8 +49,8 @@ class Scale:
 
 
 SCALES = {
-    "tiny": Scale(210, 210, 12, 2.4, 24, 1.4, 4),  # seconds
-    "small": Scale(300, 260, 24, 3.4, 110, 2.6, 8),  # a minute
+    "tiny": Scale(210, 150, 12, 2.0, 24, 1.4, 4),  # seconds
+    "small": Scale(300, 240, 24, 3.0, 110, 2.6, 8),  # a minute
     "medium": Scale(420, 420, 24, 6.0, 340, 4.6, 24),  # minutes
     "paper": Scale(1462, 2193, 24, 37.5, 3000, 18.0, 360),  # hours: the capture of the paper, sec. 3
 }
@@ -68,7 +68,7 @@ class SimulateParams:
     pitch_mm: float = 1 / 35
     aperture_cone_deg: float = 10.0
     step_mm: float = 0.2  # between photographs of a sweep
-    full_well_e: float = 30000.0  # electrons at white level: sets the shot noise
+    full_well_e: float = 15000.0  # electrons at white level: sets the shot noise
     read_noise_e: float = 6.0  # electrons, rms
     exposure: float = 0.75  # of white: what the brightest hundredth of the hair reaches in red
     open_f_number: float = 2.8  # the f-number at which the aperture has the cone above
@@ -81,32 +81,49 @@ class Look:
 
     hair: tuple[float, float, float]  # light that enters the fiber and comes back
     shine: float  # of the white highlight, relative to it
-    depth: float  # how much of the light a layer of hair takes away, 0 … 1
+    depth: float  # how much of the light its own cross-section of hair takes away, about 1
     board: tuple[float, float, float] = (0.045, 0.085, 0.23)
 
 
 LOOKS = {
-    "straight": Look((0.60, 0.43, 0.27), 0.55, 0.75),  # medium brown
-    "wavy": Look((0.80, 0.64, 0.42), 0.40, 0.55),  # blond
-    "curls": Look((0.40, 0.27, 0.17), 0.80, 0.90),  # dark brown
+    "straight": Look((0.60, 0.39, 0.21), 0.9, 1.6),  # medium brown
+    "wavy": Look((0.80, 0.62, 0.38), 0.6, 1.1),  # blond
+    "curls": Look((0.40, 0.25, 0.14), 1.4, 2.0),  # dark brown
 }
 
 
 # ---- the lens --------------------------------------------------------------------------------------------------------
 
 
-def lens_points(count: int, radius_mm: float, rng) -> np.ndarray:
-    """Points (count, 4): place on the lens disc (2, mm) and shift of the photograph (2, in pixels, -0.5 … 0.5).
+@dataclass(frozen=True)
+class Lens:
+    """The points on the lens disc from which the hair is drawn, n times; in each drawing every row has a point of its own.
 
-    A sunflower's spiral on the disc and the R2 sequence for the shifts: both even in every direction at any count; turned
-    and shifted by ``rng``, so that no two photographs repeat a pattern.
+    In row r, drawing i is seen from v = v_mm[i] and u = chord * (2 * frac(phase[i] + turn[r]) - 1), with chord the disc's half
+    width at that v. The points of a row are a golden-ratio lattice on the disc, even in number and in every direction; the
+    next row has another turn of it, so that a blurred fiber leaves no copies of itself that run along with it.
     """
-    i = np.arange(count)
-    radius = radius_mm * np.sqrt((i + 0.5) / count)
-    angle = i * np.pi * (3 - np.sqrt(5)) + 2 * np.pi * rng.random()
-    plastic = 1.32471795724474602596
+
+    radius_mm: float
+    phase: np.ndarray  # (n,) 0 … 1
+    v_mm: np.ndarray  # (n,)
+    shift_px: np.ndarray  # (n, 2) of the whole photograph, columns and rows, -0.5 … 0.5
+    turn: np.ndarray  # (rows,) 0 … 1
+
+    def points(self, row: int) -> np.ndarray:
+        """The points (n, 2) u, v in mm from which a row is seen."""
+        chord = np.sqrt(np.maximum(self.radius_mm**2 - self.v_mm**2, 0))
+        return np.stack([chord * (2 * ((self.phase + self.turn[row]) % 1.0) - 1), self.v_mm], axis=-1)
+
+
+def lens(count: int, radius_mm: float, rows: int, rng) -> Lens:
+    """``count`` points on a lens disc for an image of ``rows``; shifted by ``rng``, so that no two photographs repeat a pattern."""
+    i, golden, plastic = np.arange(count), (np.sqrt(5) - 1) / 2, 1.32471795724474602596
+    v = np.linspace(-1, 1, 20001)
+    share = 0.5 + (v * np.sqrt(1 - v * v) + np.arcsin(v)) / np.pi  # of the disc below v
+    v = np.interp((i + rng.random()) / count, share, v)
     shift = (np.stack([i / plastic, i / plastic**2], axis=-1) + rng.random(2)) % 1.0 - 0.5
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), shift])
+    return Lens(radius_mm, (i * golden + rng.random()) % 1.0, radius_mm * v, shift, (np.arange(rows) * (np.sqrt(2) - 1)) % 1.0)
 
 
 def aperture_radius_mm(optics: Optics) -> float:
@@ -115,13 +132,13 @@ def aperture_radius_mm(optics: Optics) -> float:
 
 
 def lens_count(optics: Optics, depth_mm: float) -> int:
-    """How many points on the lens make a fiber ``depth_mm`` out of focus an even blur, without copies of it.
+    """How many points on the lens make a fiber ``depth_mm`` out of focus an even blur.
 
-    Enough that neighbouring copies lie 0.4 px apart on average: a fiber is 2 to 4 px wide. Beyond 256 the copies of a
-    single fiber are fainter than the sensor's noise.
+    As many as its blur is pixels wide, and half more: a fiber, 2 to 4 px wide, is then met by 4 of them in each pixel, evenly
+    spread, and by others in the next row. 160 are enough for any blur: the wider it is, the less a single fiber counts.
     """
     blur_px = 2 * aperture_radius_mm(optics) * depth_mm / (optics.working_distance_mm * optics.pitch_mm)
-    return int(np.clip(2.5 * blur_px, 48, 256))
+    return int(np.clip(1.5 * blur_px, 48, 160))
 
 
 # ---- hair, ready to be drawn -----------------------------------------------------------------------------------------
@@ -148,19 +165,21 @@ def prepare(groom: Groom, rng, chord_error_mm: float = 0.0015) -> Hair:
         along = np.gradient(points, axis=0)[keep]
         tangents.append(along / np.linalg.norm(along, axis=1, keepdims=True))
         kept.append(keep + groom.offsets[i])
-        tints.append(rng.lognormal(0, 0.16) * (1 + 0.06 * _texture(points[keep, 1], rng)))
+        tints.append(rng.lognormal(0, 0.25) * (1 + 0.06 * _texture(points[keep, 1], rng)))
     fiber = np.repeat(np.arange(len(groom), dtype=np.int32), [len(k) for k in kept])
     kept = np.concatenate(kept)
     segments = np.flatnonzero(np.diff(fiber) == 0)
     return Hair(groom.points_mm[kept], np.concatenate(tangents), groom.radii_mm[fiber], fiber, np.concatenate(tints), segments)
 
 
-def _thin(points: np.ndarray, chord_error_mm: float) -> np.ndarray:
-    """Indices of every k-th point, both ends included, with k so that chords stay within the error."""
-    bend = np.linalg.norm(np.diff(points, 2, axis=0), axis=1).max(initial=0)  # of the curve, times step²
-    every = max(int(np.sqrt(8 * chord_error_mm / max(bend, 1e-12))), 1)
-    count = max(int(np.ceil((len(points) - 1) / every)), 1)
-    return np.unique(np.linspace(0, len(points) - 1, count + 1).round().astype(np.int64))
+def _thin(points: np.ndarray, chord_error_mm: float, longest_mm: float = 0.6) -> np.ndarray:
+    """Indices of points (n, 3) to keep, both ends included: the denser the more the curve bends there."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    bend = np.pad(curvature(points), 1, mode="edge") if len(points) > 2 else np.zeros(len(points))
+    bend = np.maximum(np.maximum(bend, np.r_[bend[1:], 0]), np.r_[0, bend[:-1]])
+    pieces = np.r_[0, np.cumsum(steps * np.maximum(np.sqrt(bend[:-1] / (8 * chord_error_mm)), 1 / longest_mm))]
+    count = max(int(np.ceil(pieces[-1])), 1)
+    return np.unique(np.searchsorted(pieces, np.linspace(0, pieces[-1], count + 1) - 1e-9).clip(0, len(points) - 1))
 
 
 def _texture(y: np.ndarray, rng) -> np.ndarray:
@@ -255,14 +274,14 @@ def _through(points, grid, low, cell, directions, depth):
                 total += grid[int(x), int(y), int(z)]
                 travelled += cell
             toll = total * cell
-            result[v, k] = 0.8 * math.exp(-depth * toll) + 0.2 * math.exp(-0.3 * depth * toll)  # the rest was scattered on
+            result[v, k] = 0.9 * math.exp(-depth * toll) + 0.1 * math.exp(-0.25 * depth * toll)  # the rest was scattered on
     return result
 
 
 def profiles() -> np.ndarray:
     """Brightness (2, 256) float32 across a fiber, from its middle to its edge in steps of q²: of its body and its highlight."""
     cosine = np.sqrt(1 - (np.arange(_PROFILE) + 0.5) / _PROFILE)
-    return np.stack([0.35 + 0.65 * cosine, cosine**3]).astype(np.float32)
+    return np.stack([0.25 + 0.75 * cosine, cosine**4]).astype(np.float32)
 
 
 def board(optics: Optics, shape: tuple[int, int], look: Look) -> np.ndarray:
@@ -301,87 +320,136 @@ def drawing(hair: Hair, angle_deg: float, shaded: Shade | None = None) -> Drawin
     return Drawing(ends, hair.fiber[order], colors)
 
 
-def photograph(hair: Drawing, background: np.ndarray, optics: Optics, focus_mm: float, lens: np.ndarray) -> np.ndarray:
+def photograph(hair: Drawing, background: np.ndarray, optics: Optics, focus_mm: float, through: Lens) -> np.ndarray:
     """The light (4, rows, columns) float32 on the sites R, G, G, B of the mosaic's cells, without noise.
 
-    background (4, rows, columns) is what stands behind the hair; lens (n, 4) is from ``lens_points``. Plane R has its
+    background (4, rows, columns) is what stands behind the hair; the lens has a turn for each of rows + 1. Plane R has its
     pixel centres at integers, the others lie half a pixel to the right, below, or both.
     """
     planes = background.astype(np.float32)
-    _photograph(
-        hair.ends, hair.colors, planes, background, lens, focus_mm, optics.working_distance_mm, optics.pitch_mm,
-        optics.axis_col_px, optics.axis_row_px, profiles(),
-    )  # fmt: skip
+    view = (np.float32(focus_mm), np.float32(optics.working_distance_mm), np.float32(optics.pitch_mm))
+    axis = (np.float32(optics.axis_col_px), np.float32(optics.axis_row_px))
+    _photograph(hair.ends, hair.colors, planes, background, *_lens_arrays(through), view, axis, profiles())
     return planes
 
 
-@njit(cache=True, nogil=True)
-def _draw(ends, lens_u, lens_v, focus, distance, pitch, axis_col, axis_row, depth, hit, at):
-    """Draw all segments as seen from one point of the lens: depth (w), index of the segment, and place on it.
+def _lens_arrays(through: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """A lens for the kernels, float32: (n, 5) of phase, half chord, v, shift in columns and in rows; turn (rows,)."""
+    chord = np.sqrt(np.maximum(through.radius_mm**2 - through.v_mm**2, 0))
+    return np.column_stack([through.phase, chord, through.v_mm, through.shift_px]).astype(np.float32), through.turn.astype(np.float32)
 
-    The pixel (r, c) of the buffers looks along the ray through column c, row r of the plane of focus. ``at`` packs the
-    place along the segment (high byte) and q² across it (low byte). Bound by the pixels' read-compare-write.
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw(ends, point, turn, view, axis, depth, hit, at):
+    """Draw all segments as seen from points of the lens, one a row: depth (w), index of the segment, and place on it.
+
+    The pixel (r, c) of the buffers looks along the ray through column c, row r of the plane of focus, both shifted by
+    point[3:]. ``at`` packs the place along the segment (high byte) and q² across it (low byte). Bound by branches that
+    cannot be foreseen, about one a row of a segment.
     """
     depth[:] = -np.inf
     hit[:] = _BARE
     rows, columns = depth.shape
+    focus, distance, pitch = view
+    half_of, one = np.float32(0.5), np.float32(1)
+    phase, chord, lens_v, per_pitch = point[0], point[1], point[2], one / pitch
+    axis_col, axis_row = axis[0] - point[3], axis[1] - point[4]
     for k in range(len(ends)):
         w0, w1, radius = ends[k, 2], ends[k, 5], ends[k, 6]
-        du0, dv0 = _project(ends[k, 0] - lens_u, ends[k, 1] - lens_v, w0, focus, distance)
-        du1, dv1 = _project(ends[k, 3] - lens_u, ends[k, 4] - lens_v, w1, focus, distance)
-        c0, r0 = _to_pixel(lens_u + du0, lens_v + dv0, pitch, axis_col, axis_row)
-        c1, r1 = _to_pixel(lens_u + du1, lens_v + dv1, pitch, axis_col, axis_row)
-        half = radius * distance / ((distance + focus - 0.5 * (w0 + w1)) * pitch)  # of its width, px
-        top, bottom = max(math.ceil(min(r0, r1) - half), 0), min(math.floor(max(r0, r1) + half), rows - 1)
-        if top > bottom or max(c0, c1) + half < 0 or min(c0, c1) - half > columns - 1:
+        # Seen from (L_u, L_v) a point appears at L + project(point - L), which is project(point) + L (1 - scale).
+        u0, v0 = _project(ends[k, 0], ends[k, 1] - lens_v, w0, focus, distance)
+        u1, v1 = _project(ends[k, 3], ends[k, 4] - lens_v, w1, focus, distance)
+        c0, r0 = _to_pixel(u0, lens_v + v0, pitch, axis_col, axis_row)
+        c1, r1 = _to_pixel(u1, lens_v + v1, pitch, axis_col, axis_row)
+        sway0 = (focus - w0) / (distance + focus - w0) * per_pitch  # px a mm of L_u
+        sway1 = (focus - w1) / (distance + focus - w1) * per_pitch
+        half = radius * per_pitch * distance / (distance + focus - half_of * (w0 + w1))  # of its width, px
+        reach = chord * max(abs(sway0), abs(sway1)) + np.float32(3) * half
+        outside = max(r0, r1) < -reach or min(r0, r1) > rows + reach
+        if outside or max(c0, c1) + reach < 0 or min(c0, c1) - reach > columns:
             continue
-        dc, dr = c1 - c0, r1 - r0
-        length = max(math.sqrt(dc * dc + dr * dr), 1e-3)
-        tc, tr = dc / length, dr / length
-        deep = (w1 - w0) / pitch
-        lean = length / math.sqrt(length * length + deep * deep)  # sine of the angle between fiber and view
-        bulge = radius / max(lean, 0.25)
-        more = 0.1 + half * math.sqrt(max(1 - lean * lean, 0.0))  # the rim of a cylinder that leans; 0.1 closes the joints
-        for r in range(top, bottom + 1):
-            y = r - r0
-            left, right = -1e9, 1e9
-            if abs(tr) > 1e-6:  # |across| < half, across = x tr - y tc
-                a, b = (y * tc - half) / tr, (y * tc + half) / tr
-                left, right = max(left, min(a, b)), min(right, max(a, b))
-            elif abs(y) > half:
-                continue
-            if abs(tc) > 1e-6:  # -more < along < length + more, along = x tc + y tr
-                a, b = (-more - y * tr) / tc, (length + more - y * tr) / tc
-                left, right = max(left, min(a, b)), min(right, max(a, b))
-            elif not -more < y * tr < length + more:
-                continue
-            first, last = max(math.ceil(left + c0), 0), min(math.floor(right + c0), columns - 1)
+        dr, deep = r1 - r0, (w1 - w0) * per_pitch
+        if abs(dr) < max(abs(c1 - c0) + chord * abs(sway1 - sway0), half_of * abs(deep)):
+            _draw_level(k, c0, r0, w0, c1, r1, w1, sway0, sway1, half, radius, per_pitch, phase, chord, turn, depth, hit, at)
+            continue
+        # Upright: each row between the ends belongs to this segment alone, so that neighbours join without a gap.
+        per_dr, dw, per_half = one / dr, w1 - w0, one / half
+        bulge = radius * math.sqrt(one + (deep * per_dr) ** 2)
+        for r in range(max(math.ceil(min(r0, r1)), 0), min(math.ceil(max(r0, r1)), rows)):
+            part = phase + turn[r]
+            lens_u = chord * (np.float32(2) * (part - one if part >= one else part) - one)
+            t = (np.float32(r) - r0) * per_dr
+            left, right = c0 + lens_u * sway0, c1 + lens_u * sway1
+            centre, lean = left + t * (right - left), (right - left) * per_dr
+            across = math.sqrt(one + lean * lean)
+            wide = half * across
+            first, last = max(math.ceil(centre - wide), 0), min(math.floor(centre + wide), columns - 1)
+            w, across = w0 + t * dw, per_half / across
+            place = int(t * np.float32(255)) << 8
             for c in range(first, last + 1):
-                x = c - c0
-                across = (x * tr - y * tc) / half
-                q = min(across * across, np.float32(0.999))
-                t = min(max((x * tc + y * tr) / length, 0.0), 1.0)
-                w = w0 + t * (w1 - w0) + bulge * math.sqrt(1 - q)
-                if w > depth[r, c]:
-                    depth[r, c] = w
+                q = (np.float32(c) - centre) * across
+                q = min(q * q, np.float32(0.999))
+                near = w + bulge * math.sqrt(one - q)
+                if near > depth[r, c]:
+                    depth[r, c] = near
                     hit[r, c] = k
-                    at[r, c] = np.uint16(int(t * 255) * 256 + int(q * 256))
+                    at[r, c] = place + int(q * np.float32(256))
 
 
-@njit(cache=True, nogil=True)
-def _photograph(ends, colors, planes, background, lens, focus, distance, pitch, axis_col, axis_row, across):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw_level(k, at0, r0, w0, at1, r1, w1, sway0, sway1, half, radius, per_pitch, phase, chord, turn, depth, hit, at):
+    """Draw a segment that lies level in the image or points at the camera: pixels nearer than ``half`` to its line.
+
+    It is drawn on beyond its ends by half its width, over its neighbours, so that no gap opens between them.
+    """
+    rows, columns = depth.shape
+    zero, half_of, one = np.float32(0), np.float32(0.5), np.float32(1)
+    dr, deep, more, per_half = r1 - r0, (w1 - w0) * per_pitch, half + np.float32(0.1), one / half
+    for r in range(max(math.ceil(min(r0, r1) - half - more), 0), min(math.floor(max(r0, r1) + half + more), rows - 1) + 1):
+        part = phase + turn[r]
+        lens_u = chord * (np.float32(2) * (part - one if part >= one else part) - one)
+        c0 = at0 + lens_u * sway0
+        dc = at1 + lens_u * sway1 - c0
+        length = math.sqrt(dc * dc + dr * dr) + np.float32(1e-4)
+        per_length = one / length
+        tc, tr, y = dc * per_length, dr * per_length, np.float32(r) - r0
+        bulge = radius * min(math.sqrt(one + (deep * per_length) ** 2), np.float32(4))
+        # |across| < half and -more < along < length + more each leave an interval of columns.
+        left, right = min(c0, c0 + dc) - half - more, max(c0, c0 + dc) + half + more
+        if abs(tr) > np.float32(1e-4):
+            centre, wide = c0 + y * tc / tr, half / abs(tr)
+            left, right = max(left, centre - wide), min(right, centre + wide)
+        elif abs(y) > half:
+            continue
+        if abs(tc) > np.float32(1e-4):
+            centre, wide = c0 + (half_of * length - y * tr) / tc, (half_of * length + more) / abs(tc)
+            left, right = max(left, centre - wide), min(right, centre + wide)
+        elif y * tr < -more or y * tr > length + more:
+            continue
+        for c in range(max(math.ceil(left), 0), min(math.floor(right), columns - 1) + 1):
+            x = np.float32(c) - c0
+            t, across = min(max((x * tc + y * tr) * per_length, zero), one), (x * tr - y * tc) * per_half
+            q = min(across * across, np.float32(0.999))
+            near = w0 + t * (w1 - w0) + bulge * math.sqrt(one - q)
+            if near > depth[r, c]:
+                depth[r, c] = near
+                hit[r, c] = k
+                at[r, c] = (int(t * np.float32(255)) << 8) + int(q * np.float32(256))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _photograph(ends, colors, planes, background, points, turn, view, axis, across):
     """Add to planes (4, rows, columns), per point of the lens, what the hair there differs from the background."""
     rows, columns = planes.shape[1:]
     depth = np.empty((rows + 1, columns + 1), np.float32)
     hit = np.empty((rows + 1, columns + 1), np.int32)
     at = np.empty((rows + 1, columns + 1), np.uint16)
-    share = np.float32(1 / len(lens))
-    for i in range(len(lens)):
-        shift_c, shift_r = lens[i, 2], lens[i, 3]
-        _draw(ends, lens[i, 0], lens[i, 1], focus, distance, pitch, axis_col - shift_c, axis_row - shift_r, depth, hit, at)
+    share = np.float32(1 / len(points))
+    for i in range(len(points)):
+        _draw(ends, points[i], turn, view, axis, depth, hit, at)
         # The ray of buffer pixel (r, c) meets the plane of focus at (r, c) + shift: within half a pixel of the red site of
         # cell (r, c), and of the sites half a pixel further of cell (r, c), or of the one before, if the shift is negative.
-        before_r, before_c = int(shift_r < 0), int(shift_c < 0)
+        before_c, before_r = int(points[i, 3] < 0), int(points[i, 4] < 0)
         for r in range(rows + 1):
             for c in range(columns + 1):
                 k = hit[r, c]
@@ -442,7 +510,7 @@ def samples(groom: Groom, radius_mm: float, half_height_mm: float, step_mm: floa
     return Samples(np.concatenate(points), np.concatenate(tangents), np.concatenate(strands))
 
 
-def visibility(hair: Hair, at: Samples, optics: Optics, angle_deg: float, rays: int = 32, slab_mm: float = 1.0) -> np.ndarray:
+def visibility(hair: Hair, at: Samples, optics: Optics, angle_deg: float, rays: int = 32, slab_mm: float = 2.0) -> np.ndarray:
     """Fraction (K,) of the aperture's rays that reach each sample, in focus, unoccluded by other fibers.
 
     For each slab of depths the hair is drawn from points of the lens at twice the resolution of the photographs, which
@@ -453,39 +521,42 @@ def visibility(hair: Hair, at: Samples, optics: Optics, angle_deg: float, rays: 
     if not len(where):
         return seen
     drawn = drawing(hair, angle_deg)
-    lens = lens_points(rays, aperture_radius_mm(optics), np.random.default_rng(0))
     pitch = optics.pitch_mm / 2
     slab = np.floor(where[:, 2] / slab_mm)
     for level in np.unique(slab):
         chosen = np.flatnonzero(slab == level)
         points = where[chosen]
         low, high = points[:, :2].min(axis=0) - 0.5, points[:, :2].max(axis=0) + 0.5
-        shape = tuple(np.ceil((high - low)[::-1] / pitch).astype(int) + 1)
-        axis_col, axis_row = -low[0] / pitch, high[1] / pitch
-        focus = (level + 0.5) * slab_mm
-        seen[chosen] = _visible(
-            drawn.ends, drawn.strand, lens, points, at.strand[chosen], focus, optics.working_distance_mm, pitch, axis_col, axis_row, shape
-        )
+        rows, columns = np.ceil((high - low)[::-1] / pitch).astype(int) + 1
+        view = (np.float32((level + 0.5) * slab_mm), np.float32(optics.working_distance_mm), np.float32(pitch))
+        axis = (np.float32(-low[0] / pitch), np.float32(high[1] / pitch))
+        spots, turn = _lens_arrays(aperture_rays(optics, rays, rows))
+        seen[chosen] = _visible(drawn.ends, drawn.strand, spots, turn, points.astype(np.float32), at.strand[chosen], view, axis, (rows, columns))
     return seen
 
 
-@njit(cache=True, nogil=True)
-def _visible(ends, strand, lens, points, own, focus, distance, pitch, axis_col, axis_row, shape):
+def aperture_rays(optics: Optics, rays: int, rows: int = 1) -> Lens:
+    """The points of the lens from which visibility is told: the same ones for every row."""
+    through = lens(rays, aperture_radius_mm(optics), rows, np.random.default_rng(0))
+    return replace(through, turn=np.zeros(rows))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _visible(ends, strand, spots, turn, points, own, view, axis, shape):
     """Fraction (K,) of points of the lens from which points (K, 3) of the camera frame on strands own (K,) are seen."""
     depth, hit, at = np.empty(shape, np.float32), np.empty(shape, np.int32), np.empty(shape, np.uint16)
     count = np.zeros(len(points))
-    for i in range(len(lens)):
-        _draw(ends, lens[i, 0], lens[i, 1], focus, distance, pitch, axis_col - lens[i, 2], axis_row - lens[i, 3], depth, hit, at)
+    for i in range(len(spots)):
+        _draw(ends, spots[i], turn, view, axis, depth, hit, at)
+        lens_u, lens_v = spots[i, 1] * (np.float32(2) * spots[i, 0] - np.float32(1)), spots[i, 2]
         for k in range(len(points)):
             w = points[k, 2]
-            u, v = _project(points[k, 0] - lens[i, 0], points[k, 1] - lens[i, 1], w, focus, distance)
-            c, r = _to_pixel(lens[i, 0] + u, lens[i, 1] + v, pitch, axis_col - lens[i, 2], axis_row - lens[i, 3])
-            r, c = round(r), round(c)
-            found = hit[r, c]
-            nearer = depth[r, c] - w
+            u, v = _project(points[k, 0] - lens_u, points[k, 1] - lens_v, w, view[0], view[1])
+            c, r = _to_pixel(lens_u + u, lens_v + v, view[2], axis[0] - spots[i, 3], axis[1] - spots[i, 4])
+            found, nearer = hit[round(r), round(c)], depth[round(r), round(c)] - w
             itself = found == _BARE or (strand[found] == own[k] and nearer < 0.5)
             count[k] += 1.0 if itself or nearer <= 0 else 0.0
-    return count / len(lens)
+    return count / len(spots)
 
 
 # ---- a whole capture -------------------------------------------------------------------------------------------------
@@ -526,7 +597,7 @@ def simulate(out: Path, params: SimulateParams, progress: Progress = silent, wor
     lock = groom(lock_params(params), np.random.default_rng([params.seed, 0]))
     progress("groom", 1, 1)
     hair = prepare(lock, np.random.default_rng([params.seed, 1]))
-    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+    with ThreadPoolExecutor((workers or os.cpu_count()) + 1) as pool:  # one more, since writing waits for the disk
         _photographs(capture, hair, params, progress, pool)
         if not capture.truth_path.is_file():
             _write_truth(capture, lock, hair, scale, progress, pool)
@@ -594,8 +665,8 @@ def _photographs(capture: Capture, hair: Hair, params: SimulateParams, progress:
         def take(shot, drawn=drawn):
             number, focus, file, through = shot
             rng = np.random.default_rng([params.seed, 2, number])
-            lens = lens_points(lens_count(through, reach + abs(focus)), aperture_radius_mm(through), rng)
-            planes = photograph(drawn, background, through, focus, lens)
+            disc = lens(lens_count(through, reach + abs(focus)), aperture_radius_mm(through), scale.rows + 1, rng)
+            planes = photograph(drawn, background, through, focus, disc)
             write_dng(capture.folder / file, expose(planes, params.full_well_e, params.read_noise_e, rng), BLACK, WHITE)
 
         for _ in _each(pool, take, missing):
