@@ -26,11 +26,11 @@ class GroomParams:
     diameter_mm: tuple[float, float] = (0.06, 0.10)  # thinnest and thickest fiber
     clump_fibers: tuple[int, int] = (4, 30)  # fibers of the smallest and of the largest clump
     flyaway_share: float = 0.03  # of fibers that leave the lock
-    clearance_mm: float = 0.003  # air that is left between fibers that were pushed apart
+    clearance_mm: float = 0.006  # air that is left between fibers that were pushed apart
     knot_mm: float = 1.0  # between the control points of a fiber; bounds its curvature
     spacing_mm: float = 0.1  # between points of the result, at most
     chord_error_mm: float = 0.0008  # a chord of the result stays this close to the smooth curve
-    rounds: int = 2000  # of pushing apart, at most
+    rounds: int = 4000  # of pushing apart, at most
 
 
 @dataclass(frozen=True)
@@ -229,14 +229,14 @@ def _push_apart(controls: np.ndarray, radii: np.ndarray, params: GroomParams) ->
     places = np.linspace(0, count - 3, (count - 3) * _pieces(controls, params) + 1)
     first, weights = _weights(places, count)
     offsets = np.arange(fibers + 1) * len(places)
-    start, built, skin = controls, None, 0.15
+    start, built, skin = controls, None, 0.06
     for turn in range(params.rounds):
         points = _evaluate(controls, first, weights).reshape(-1, 3)
         if built is None or np.abs(points - built).max() > skin / 4:
             near = _near_segments(points, offsets, 2 * radii.max() + params.clearance_mm + skin)
             built = points
         moves, worst = _moves(points, *near, len(places), radii, params.clearance_mm, first, weights, fibers, count)
-        if worst <= 0.4 * params.clearance_mm:
+        if worst <= 0.5 * params.clearance_mm:  # the last of it takes the longest
             return controls
         controls = controls + moves
         if turn < 100:
@@ -254,11 +254,11 @@ def _push_apart(controls: np.ndarray, radii: np.ndarray, params: GroomParams) ->
 def _pieces(controls: np.ndarray, params: GroomParams) -> int:
     """Segments a knot while fibers are pushed apart: short enough that chords stray little, were all as bent as the most bent."""
     second = np.linalg.norm(np.diff(controls, 2, axis=1), axis=2).max()
-    return int(np.ceil(max(params.knot_mm / 0.2, np.sqrt(second / (8 * 0.3 * params.clearance_mm)))))
+    return int(np.ceil(max(params.knot_mm / 0.2, np.sqrt(second / (8 * 0.25 * params.clearance_mm)))))
 
 
 def _near_segments(points: np.ndarray, offsets: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of segments (k,), (k,), named by their first points, that may come closer than ``reach_mm`` to each other.
+    """Pairs of segments (k,), (k,), named by their first points, that are closer than ``reach_mm`` to each other.
 
     Of one fiber, only pairs that are far along it count.
     """
@@ -269,8 +269,11 @@ def _near_segments(points: np.ndarray, offsets: np.ndarray, reach_mm: float) -> 
     first, second = start[pairs].T if len(pairs) else (np.zeros(0, np.int64),) * 2
     fiber = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
     far = (fiber[first] != fiber[second]) | (np.abs(first - second) * longest > 4.0)
-    order = np.lexsort((second[far], first[far]))  # the tree's order is its own affair
-    return first[far][order], second[far][order]
+    first, second = first[far], second[far]
+    close = _segment_distances(points, first, second) < reach_mm
+    first, second = first[close], second[close]
+    order = np.lexsort((second, first))  # the tree's order is its own affair
+    return first[order], second[order]
 
 
 @njit(cache=True, nogil=True)
