@@ -22,8 +22,9 @@ from .geometry import Optics, object_points, to_image, to_pixel, turn
 STRIP_PX, BLOCK_PX = 32, 16  # columns and rows of a cell
 COL_STEPS, ROW_STEPS = 65536 // STRIP_PX, 65536 // BLOCK_PX  # units of the stored column and row, a pixel
 ANGLE_STEPS = 256  # units of the stored angle, over pi
-STRENGTH_STEPS = 24.0  # units of the stored strength, a factor of e
-STRENGTH_LEAST = 1e-3  # strength that is stored as 1; 0 means that the feature has been used up
+STRENGTH_STEPS = 12.0  # units of the stored strength, a factor of e
+STRENGTH_LEAST = 1e-3  # strength that is stored as 0
+USED = 128  # added to the stored strength of a feature that a fiber has used up
 
 _to_pixel, _to_image = njit(to_pixel), njit(to_image)
 
@@ -65,7 +66,7 @@ def pack(angle_deg: float, positions_mm: Sequence[float], shape: tuple[int, int]
     cell = (strip * blocks + block) * len(found) + frame
     order_in = np.argsort(cell, kind="stable")
     counts = np.bincount(cell, minlength=strips * blocks * len(found))
-    level = 1 + np.rint(np.log(np.maximum(strength, STRENGTH_LEAST) / STRENGTH_LEAST) * STRENGTH_STEPS)
+    level = np.rint(np.log(np.maximum(strength, STRENGTH_LEAST) / STRENGTH_LEAST) * STRENGTH_STEPS)
     return SweepFeatures(
         angle_deg=float(angle_deg),
         positions_mm=np.asarray(positions_mm, np.float64)[order],
@@ -75,7 +76,7 @@ def pack(angle_deg: float, positions_mm: Sequence[float], shape: tuple[int, int]
         row=((row - block * BLOCK_PX) * ROW_STEPS).astype(np.uint16)[order_in],
         frame=frame[order_in],
         angle=(np.rint(angle * (ANGLE_STEPS / np.pi)).astype(np.int64) % ANGLE_STEPS).astype(np.uint8)[order_in],
-        strength=np.clip(level, 1, 255).astype(np.uint8)[order_in],
+        strength=np.clip(level, 0, USED - 1).astype(np.uint8)[order_in],
     )
 
 
@@ -126,7 +127,7 @@ def load_features(path: Path) -> SweepFeatures:
 
 
 class Index(NamedTuple):
-    """All sweeps in memory, as kernels take them: 8 bytes a feature and the cells. ``strength`` 0 is a feature used up."""
+    """All sweeps in memory, as kernels take them: 8 bytes a feature and the cells. A ``strength`` of USED or more is a feature used up."""
 
     col: np.ndarray
     row: np.ndarray
@@ -226,7 +227,7 @@ def _box_hits(index, k, centre, axes, half, hits):
             for i in range(start, stop):
                 u, v = image_of(index, i, strip, block)
                 x, y, z = u - centre[0], v - centre[1], index.positions[index.first_position[k] + index.frame[i]] - centre[2]
-                inside = index.strength[i] > 0
+                inside = index.strength[i] < USED
                 for a in range(3):
                     inside = inside and abs(axes[a, 0] * x + axes[a, 1] * y + axes[a, 2] * z) <= half[a]
                 if inside:

@@ -10,9 +10,12 @@ Departures from the paper, all off in ``PAPER``:
 * A camera's orientation joins the angles of its features and the slope of their positions along the hair.
 * A camera speaks only when enough of its rows see the hair.
 
+* The clearest fibers come first: several passes over the seeds, each content with less evidence. The evidence of a point is
+  the sum over cameras of the share of a fully seen hair that they saw, 1 for each camera with a free view.
+
 Seeds are grown in batches that do not depend on the number of threads: every seed of a batch grows on the observations that
-earlier batches left, then the curves are accepted in a fixed order, longest first, unless most of what they stand on was
-taken by one before. The result is the same for any number of threads.
+earlier batches left, then the curves are accepted in a fixed order, most evidence first, unless much of what they stand on
+was taken by one before; what is refused is tried again in the next pass. The result is the same for any number of threads.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -27,6 +30,7 @@ from .features import (
     ANGLE_STEPS,
     BLOCK_PX,
     STRIP_PX,
+    USED,
     Index,
     cell_range,
     frames_between,
@@ -39,7 +43,7 @@ from .progress import Progress, silent
 _turn, _turn_back, _slope, _to_pixel, _to_image, _project = (
     njit(turn), njit(turn_back), njit(slope), njit(to_pixel), njit(to_image), njit(project),
 )  # fmt: skip
-BATCH = 256  # seeds grown against the same observations; part of the result, not of the machine
+BATCH = 64  # seeds grown against the same observations; part of the result, not of the machine
 MAX_HITS = 2048  # features of one camera that one step looks at
 
 
@@ -62,17 +66,21 @@ class GrowParams:
     near_focus_mm: float = 0.3  # a_s of find_orientations: full extent
     min_cameras: int = 3  # m: cameras that a step needs
     bridge_mm: float = 1.0  # how far a hair is continued straight where it is not observed
+    min_own: float = 0.45  # share of the observations of a curve that no curve before has used up
+    min_evidence: float = 1.0  # evidence that a step needs
+    pass_evidence: tuple[float, ...] = (5.0, 2.5, 1.25)  # evidence of a seed in each pass; a curve needs half of it on average
     min_seed_cameras: int = 4  # angles that a seed cell must have recorded
     seed_cell_mm: float = 0.2
     min_length_mm: float = 2.0  # shorter curves are taken for chance
     max_length_mm: float = 400.0
     weighted: bool = True  # False: every observation in the box counts the same, as in the paper
-    sigma_px: float = 0.6  # weight across the ribbon
-    agree_px: float = 1.0  # a camera whose ribbon passes farther from where the others meet is not heard
-    claim_px: float = 1.0  # observations this near to a curve are used up by it
-    sigma_deg: float = 6.0  # weight by angle; 2.2 of it is the gate
+    sigma_px: float = 0.5  # weight across the ribbon
+    agree_px: float = 0.8  # a camera whose ribbon passes farther from where the others meet is not heard
+    claim_px: float = 0.6  # observations this near to a curve are used up by it
+    shared_weight: float = 0.2  # of an observation that another curve has used up: hairs cross in every photograph
+    sigma_deg: float = 4.0  # weight by angle; 2.2 of it is the gate
     sigma_focus_mm: float = 0.3  # weight by distance from the plane of focus
-    min_support: float = 0.25  # a camera speaks when it has this share of the observations of a hair in full view
+    min_support: float = 0.1  # a camera speaks when it has this share of the observations of a hair in full view
     radius_mm: float = 0.04
 
 
@@ -86,7 +94,7 @@ class Grown:
 
     points_mm: np.ndarray  # (N, 3) float32
     offsets: np.ndarray  # (M + 1,) int64
-    cameras: np.ndarray  # (N,) uint8: how many spoke at the point
+    evidence: np.ndarray  # (N,) float32: cameras that saw the point, each by the share of a free view that it had
     stops: np.ndarray  # (M, 2) uint8: Stop of either end
     tried: int  # seeds looked at
 
@@ -107,9 +115,12 @@ class _Box(NamedTuple):
     sigma: float
     agree: float
     claim: float
+    shared: float
     sigma_angle: float
     sigma_focus: float
     min_support: float
+    full_support: float
+    min_evidence: float
     min_seed_cameras: int
 
 
@@ -132,9 +143,12 @@ def _box(params: GrowParams, index: Index) -> _Box:
         sigma=params.sigma_px * pitch_mm,
         agree=params.agree_px * pitch_mm,
         claim=params.claim_px * pitch_mm,
+        shared=params.shared_weight if params.weighted else 0.0,
         sigma_angle=float(np.radians(params.sigma_deg)),
         sigma_focus=params.sigma_focus_mm,
         min_support=params.min_support * full_support if params.weighted else 1.0,
+        full_support=full_support if params.weighted else 1.0,
+        min_evidence=params.min_evidence if params.weighted else 0.0,
         min_seed_cameras=params.min_seed_cameras,
     )
 
@@ -171,7 +185,7 @@ def _hair_frame(index, k, p, g):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _gather(index, k, frame, angle, box, hits):
-    """Observations of camera k in the box of a hair; hits (n, 5) receives along, slope, across (mm), turn (rad) and weight 1.
+    """Observations of camera k in the box of a hair; hits (n, 5) receives along, slope, across (mm), turn (rad) and weight.
 
     Bound by cache misses: a few dozen runs of 8-byte features.
     """
@@ -189,7 +203,8 @@ def _gather(index, k, frame, angle, box, hits):
                 x, y = u - frame[0, 0], v - frame[0, 1]
                 z = index.positions[index.first_position[k] + index.frame[i]] - frame[0, 2]
                 across = frame[3, 0] * x + frame[3, 1] * y + frame[3, 2] * z
-                if abs(across) > half[2] or index.strength[i] == 0:
+                used = index.strength[i] >= USED
+                if abs(across) > half[2] or (used and box.shared == 0):
                     continue
                 along = frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z
                 depth = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z
@@ -201,7 +216,7 @@ def _gather(index, k, frame, angle, box, hits):
                     continue
                 if count == len(hits):
                     return count
-                hits[count] = along, depth, across, off, 1.0
+                hits[count] = along, depth, across, off, box.shared if used else 1.0
                 count += 1
     return count
 
@@ -220,7 +235,7 @@ def _speak(hits, count, box, centre):
         if box.weighted:  # biweights of the width of Gaussians of these sigmas: no exp, and nothing from far away
             x, y, z = (across - centre) / box.sigma, off / box.sigma_angle, depth / box.sigma_focus
             x, y, z = max(1 - 0.207 * x * x, 0.0), max(1 - 0.207 * y * y, 0.0), max(1 - 0.207 * z * z, 0.0)
-            weight = x * x * y * y * z * z
+            weight = x * x * y * y * z * z * hits[i, 4]
         w += weight
         we += weight * across
         if box.weighted or abs(depth) <= box.near_focus:
@@ -392,22 +407,30 @@ def _new_view(cameras):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _grow_end(index, p, g, box, hits, view, points, cameras):
-    """Grow from p along g; fills points (n, 3) and cameras (n,). Returns (points kept, Stop). The seed itself is not written."""
+def _observe(index, p, g, box, hits, view):
+    """Ask the cameras and leave out those that disagree. Returns (cameras that agree, evidence, cameras that could see)."""
+    spoke, could = _look(index, p, g, box, hits, view)
+    if box.weighted and spoke:
+        spoke = _listen(view, g, box)
+    evidence = 0.0
+    for k in range(len(view.weight)):
+        evidence += min(view.weight[k] / box.full_support, 1.0)
+        view.turned[k] = view.turned[k] and view.weight[k] > 0
+    return spoke, evidence, could
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _grow_end(index, p, g, box, hits, view, points, evidence):
+    """Grow from p along g; fills points (n, 3) and evidence (n,). Returns (points kept, Stop). The seed itself is not written."""
     count = kept = unseen = 0
     while count < min(box.max_points, len(points)):
         p = p + box.step * g
-        spoke, could = _look(index, p, g, box, hits, view)
+        spoke, seen, could = _observe(index, p, g, box, hits, view)
         if could < box.min_cameras:
             return kept, Stop.LEFT_VOLUME.value
-        if box.weighted:
-            spoke = _listen(view, g, box)
-        if spoke >= box.min_cameras:
+        if spoke >= box.min_cameras and seen >= box.min_evidence:
             p = _corrected(p, g, view, box.gamma)
-            directed = 0
-            for k in range(len(view.weight)):
-                directed += view.turned[k] and view.weight[k] > 0
-            if directed >= box.min_cameras:
+            if np.sum(view.turned) >= box.min_cameras:
                 g = _within_cone(solve_direction(view.normal, view.weight * view.turned, g), g, box)
             unseen = 0
         else:
@@ -415,7 +438,7 @@ def _grow_end(index, p, g, box, hits, view, points, cameras):
             if unseen > box.bridge:
                 return kept, Stop.UNOBSERVED.value
         points[count] = p
-        cameras[count] = spoke
+        evidence[count] = seen
         count += 1
         if unseen == 0:
             kept = count
@@ -424,39 +447,40 @@ def _grow_end(index, p, g, box, hits, view, points, cameras):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _snap(index, p, g, box, hits, view):
-    """Draw a seed onto the centreline: (ok, p, g). It must come to rest with enough cameras."""
+    """Draw a seed onto the centreline: (evidence, p, g). It must come to rest with enough cameras; evidence is 0 if not."""
     start = p.copy()
+    moved = evidence = 0.0
     for trial in range(5):
-        spoke, _ = _look(index, p, g, box, hits, view)
-        if spoke < (box.min_seed_cameras if trial else box.min_cameras):
-            return False, p, g
-        if trial > 1 and box.weighted and _listen(view, g, box) < box.min_seed_cameras:
-            return False, p, g
+        if trial < 2:  # from the middle of a cell the hair may be far: nobody is left out yet
+            spoke, _ = _look(index, p, g, box, hits, view)
+        else:
+            spoke, evidence, _ = _observe(index, p, g, box, hits, view)
+        if spoke < box.min_seed_cameras or np.sum(view.turned) < box.min_cameras:
+            return 0.0, p, g
         before = p
         p = _corrected(p, g, view, 2 * box.half[2])
         g = solve_direction(view.normal, view.weight * view.turned, g)
         moved = np.sqrt(np.sum((p - before) ** 2))
         if np.sqrt(np.sum((p - start) ** 2)) > 3 * box.half[2]:
-            return False, p, g
-    return moved < 2 * box.gamma, p, g
+            return 0.0, p, g
+    return evidence if moved < 2 * box.gamma else 0.0, p, g
 
 
 @njit(cache=True, nogil=True)
-def _grow_seeds(index, seeds, directions, box, points, cameras, begin, end, stops):
-    """Grow every seed on the same observations. Curve b is points[b, begin[b]:end[b]], the seed in the middle of the row."""
+def _grow_seeds(index, seeds, directions, least, box, points, evidence, begin, end, stops, strength):
+    """Grow every seed of enough evidence on the same observations. Curve b is points[b, begin[b]:end[b]], the seed in the
+    middle of the row; strength[b] is the seed's evidence."""
     middle = points.shape[1] // 2
     hits = np.empty((MAX_HITS, 5))
     view = _new_view(len(index.cos))
     for b in range(len(seeds)):
         begin[b] = end[b] = middle
-        ok, p, g = _snap(index, seeds[b], directions[b], box, hits, view)
-        if not ok:
+        strength[b], p, g = _snap(index, seeds[b], directions[b], box, hits, view)
+        if strength[b] < least or strength[b] == 0:
             continue
-        points[b, middle] = p
-        spoke, _ = _look(index, p, g, box, hits, view)
-        cameras[b, middle] = spoke
-        ahead, stop_ahead = _grow_end(index, p, g, box, hits, view, points[b, middle + 1 :], cameras[b, middle + 1 :])
-        back, stop_back = _grow_end(index, p, -g, box, hits, view, points[b, middle - 1 :: -1], cameras[b, middle - 1 :: -1])
+        points[b, middle], evidence[b, middle] = p, strength[b]
+        ahead, stop_ahead = _grow_end(index, p, g, box, hits, view, points[b, middle + 1 :], evidence[b, middle + 1 :])
+        back, stop_back = _grow_end(index, p, -g, box, hits, view, points[b, middle - 1 :: -1], evidence[b, middle - 1 :: -1])
         begin[b], end[b] = middle - back, middle + 1 + ahead
         stops[b, 0], stops[b, 1] = stop_back, stop_ahead
 
@@ -494,9 +518,9 @@ def _claim(index, points, box, take):
                         if abs(off) > 2.2 * box.sigma_angle:
                             continue
                         total += 1
-                        there += index.strength[i] > 0
+                        there += index.strength[i] < USED
                         if take:
-                            index.strength[i] = 0
+                            index.strength[i] |= USED
     return there, total
 
 
@@ -510,8 +534,8 @@ class _Grid(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _raster(index, grid, masks, threshold):
-    """Set bit k of every cell of masks (nx, ny, nz) in which sweep k has a feature of at least the given strength."""
+def _raster(index, grid, masks):
+    """Set bit k of every cell of masks (nx, ny, nz) in which sweep k has a feature."""
     for k in range(len(index.cos)):
         frames = index.first_position[k + 1] - index.first_position[k]
         strips, blocks = index.columns // STRIP_PX + 1, index.rows // BLOCK_PX + 1
@@ -519,8 +543,6 @@ def _raster(index, grid, masks, threshold):
             for block in range(blocks):
                 start, stop = run_of(index, k, strip, block, 0, frames)
                 for i in range(start, stop):
-                    if index.strength[i] < threshold:
-                        continue
                     u, v = image_of(index, i, strip, block)
                     d = index.positions[index.first_position[k] + index.frame[i]]
                     x, y, z = _turn_back(u, v, d, index.cos[k], index.sin[k])
@@ -557,7 +579,7 @@ def _seed_directions(index, centres, cell, least, directions, cameras):
                 for block in range(b0, b1):
                     start, stop = run_of(index, k, strip, block, first_frame, last_frame)
                     for i in range(start, stop):
-                        if index.strength[i] == 0:
+                        if index.strength[i] >= USED:
                             continue
                         u, v = image_of(index, i, strip, block)
                         if abs(u - u0) > 0.75 * cell or abs(v - v0) > 0.75 * cell:
@@ -596,7 +618,7 @@ def _seeds(index: Index, params: GrowParams) -> np.ndarray:
     """Centres (n, 3) mm of the cells that at least ``min_seed_cameras`` sweeps recorded, most angles first."""
     grid = _seed_grid(index, params)
     masks = np.zeros(grid.shape, np.uint64)
-    _raster(index, grid, masks, 1)
+    _raster(index, grid, masks)
     counts = _bits(masks)
     cells = np.flatnonzero(counts.ravel() >= params.min_seed_cameras)
     found = counts.ravel()[cells]
@@ -616,24 +638,38 @@ def grow(index: Index, params: GrowParams, workers: int = 1, progress: Progress 
     """
     box = _box(params, index)
     centres = _seeds(index, params)
+    bound = np.full(len(centres), np.inf)  # evidence of each seed when last looked at; it can only fall
     store = _BatchStore.of(BATCH, 2 * min(box.max_points, _longest(index, params)) + 1)
     curves: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    block = 16 * BATCH
+    passes = params.pass_evidence if params.weighted else (0.0,)
     with ThreadPoolExecutor(workers) as pool:
-        for start in range(0, len(centres), block):
-            progress("growing", start, len(centres))
-            some = centres[start : start + block]
-            directions, cameras = np.zeros((len(some), 3)), np.zeros(len(some), np.int64)
-            least = params.min_seed_cameras
-            _in_parts(pool, 256, len(some), lambda s: _seed_directions(index, some[s], params.seed_cell_mm, least, directions[s], cameras[s]))  # noqa: B023
-            good = np.flatnonzero(cameras >= least)
-            for first in range(0, len(good), BATCH):
-                chosen = good[first : first + BATCH]
-                seeds, ways = some[chosen], directions[chosen]
-                _in_parts(pool, 8, len(chosen), lambda s: _grow_seeds(index, seeds[s], ways[s], box, *store.part(s)))  # noqa: B023
-                curves += _accept(index, store, len(chosen), params, box)
-    progress("growing", len(centres), len(centres))
+        for number, least in enumerate(passes):
+            seeds = np.flatnonzero(bound >= least)
+            for first in range(0, len(seeds), BATCH):
+                progress("growing", number + first / max(len(seeds), 1), len(passes))
+                chosen = seeds[first : first + BATCH]
+                bound[chosen] = _grow_batch(pool, index, centres[chosen], least, params, box, store)
+                curves += _accept(index, store, len(chosen), 0.5 * least, params, box)
+    progress("growing", len(passes), len(passes))
     return _flat(curves, len(centres))
+
+
+def _grow_batch(pool: ThreadPoolExecutor, index: Index, seeds: np.ndarray, least: float, params: GrowParams, box: _Box, store: "_BatchStore"):
+    """Grow the seeds (b, 3) of a batch into ``store``; returns their evidence (b,)."""
+
+    def work(part: slice) -> None:
+        directions, cameras = np.zeros((len(seeds[part]), 3)), np.zeros(len(seeds[part]), np.int64)
+        _seed_directions(index, seeds[part], params.seed_cell_mm, params.min_seed_cameras, directions, cameras)
+        store.strength[part] = 0
+        store.begin[part] = store.end[part] = 0
+        good = cameras >= params.min_seed_cameras
+        rows = np.arange(part.start, part.stop)[good]
+        for row, direction in zip(rows, directions[good], strict=True):
+            one = slice(row, row + 1)
+            _grow_seeds(index, seeds[one], direction[None], least, box, *store.part(one))
+
+    _in_parts(pool, 8, len(seeds), work)
+    return store.strength[: len(seeds)].copy()
 
 
 def _in_parts(pool: ThreadPoolExecutor, size: int, count: int, work) -> None:
@@ -652,39 +688,43 @@ class _BatchStore:
     """Room for the curves of a batch, made once."""
 
     points: np.ndarray
-    cameras: np.ndarray
+    evidence: np.ndarray
     begin: np.ndarray
     end: np.ndarray
     stops: np.ndarray
+    strength: np.ndarray
 
     @classmethod
     def of(cls, seeds: int, points: int) -> "_BatchStore":
         counts = [np.zeros(seeds, np.int64) for _ in range(2)]
-        return cls(np.empty((seeds, points, 3)), np.empty((seeds, points), np.uint8), *counts, np.zeros((seeds, 2), np.uint8))
+        return cls(np.empty((seeds, points, 3)), np.empty((seeds, points), np.float32), *counts, np.zeros((seeds, 2), np.uint8), np.zeros(seeds))
 
     def part(self, s: slice):
-        return self.points[s], self.cameras[s], self.begin[s], self.end[s], self.stops[s]
+        return self.points[s], self.evidence[s], self.begin[s], self.end[s], self.stops[s], self.strength[s]
+
+    def curve(self, b: int):
+        """Copies of the points, the evidence and the stops of curve b."""
+        row = slice(self.begin[b], self.end[b])
+        return self.points[b, row].copy(), self.evidence[b, row].copy(), self.stops[b].copy()
 
 
-def _accept(index, store: _BatchStore, count: int, params: GrowParams, box: _Box):
-    """The curves of a batch that are long enough and stand on observations of their own, longest first."""
-    sizes = store.end[:count] - store.begin[:count]
+def _accept(index, store: _BatchStore, count: int, least: float, params: GrowParams, box: _Box):
+    """The curves of a batch that are long enough, have evidence and stand on observations of their own; most evidence first."""
     accepted = []
-    for b in np.argsort(-sizes, kind="stable"):
-        if (sizes[b] - 1) * params.step_mm < params.min_length_mm:
-            break
-        points = store.points[b, store.begin[b] : store.end[b]].copy()
+    long = [b for b in range(count) if (store.end[b] - store.begin[b] - 1) * params.step_mm >= params.min_length_mm]
+    for curve in sorted((store.curve(b) for b in long), key=lambda c: -float(c[1].sum())):
+        points, evidence, _ = curve
         there, total = _claim(index, points, box, False)
-        if there < 0.5 * total or total == 0:
+        if there < params.min_own * total or total == 0 or evidence.mean() < least:
             continue
         _claim(index, points, box, True)
-        accepted.append((points, store.cameras[b, store.begin[b] : store.end[b]].copy(), store.stops[b].copy()))
+        accepted.append(curve)
     return accepted
 
 
 def _flat(curves, tried: int) -> Grown:
     if not curves:
-        return Grown(np.zeros((0, 3), np.float32), np.zeros(1, np.int64), np.zeros(0, np.uint8), np.zeros((0, 2), np.uint8), tried)
-    points, cameras, stops = zip(*curves, strict=True)
+        return Grown(np.zeros((0, 3), np.float32), np.zeros(1, np.int64), np.zeros(0, np.float32), np.zeros((0, 2), np.uint8), tried)
+    points, evidence, stops = zip(*curves, strict=True)
     offsets = np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64)
-    return Grown(np.concatenate(points).astype(np.float32), offsets, np.concatenate(cameras), np.stack(stops), tried)
+    return Grown(np.concatenate(points).astype(np.float32), offsets, np.concatenate(evidence), np.stack(stops), tried)
