@@ -101,8 +101,10 @@ def _controls(params: GroomParams, rng) -> np.ndarray:
     members = _clumps(params, rng)
     loose = rng.random(params.fibers) < params.flyaway_share
     curl = _curl(params, rng)
-    guides = np.stack([_guide(y, curl, params, rng) for _ in range(members.max() + 1)])  # (clumps, n, 2) of x, z
-    spread = np.stack([_spread(y, np.sum(members == i), params, rng) for i in range(len(guides))])  # (clumps, n) mm
+    sizes = np.bincount(members)
+    centres = _centres(sizes, params, rng)
+    guides = np.stack([centre + _guide(y, curl, params, rng) for centre in centres])  # (clumps, n, 2) of x, z
+    spread = np.stack([_spread(y, size, params, rng) for size in sizes])  # (clumps, n) mm
     place = _disc(params.fibers, rng)  # of each fiber in its clump, in radii of the clump
     twist = np.stack([_wander(y, 0.3, (8, 30), rng)[:, 0] for _ in guides])  # radians: a clump turns about its guide
     xz = np.empty((params.fibers, count, 2))
@@ -125,6 +127,17 @@ def _clumps(params: GroomParams, rng) -> np.ndarray:
     return np.array(members[: params.fibers])
 
 
+def _centres(sizes: np.ndarray, params: GroomParams, rng) -> np.ndarray:
+    """Where the clumps (C,) hang in the lock, (C, 2) mm: a sunflower of them, in disorder, that leaves room at the rim."""
+    order = rng.permutation(len(sizes))
+    around = 2 * np.pi * rng.random() + order * np.pi * (3 - np.sqrt(5))
+    room = params.lock_radius_mm * np.sqrt(sizes / params.fibers)
+    radius = np.sqrt((order + rng.random(len(sizes))) / len(sizes)) * np.maximum(params.lock_radius_mm - 0.7 * room, 0)
+    if params.style != "straight":
+        radius *= 0.65  # waves and ringlets reach out by themselves
+    return np.stack([radius * np.cos(around), radius * np.sin(around)], axis=-1)
+
+
 def _disc(count: int, rng) -> np.ndarray:
     """Points (count, 2) spread evenly at random over the unit disc."""
     radius, angle = np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
@@ -144,7 +157,7 @@ def _spread(y: np.ndarray, size: int, params: GroomParams, rng) -> np.ndarray:
     """Radius (n,) mm of a clump of ``size`` fibers along y: closed here, opened there."""
     packed = params.diameter_mm[1] * np.sqrt(size)
     room = params.lock_radius_mm * np.sqrt(size / params.fibers)
-    shut, wide = 1.1 * packed, max(1.1 * room, 1.6 * packed)
+    shut, wide = max(0.6 * room, 1.1 * packed), max(1.2 * room, 1.6 * packed)
     opening = 0.5 + 0.5 * np.sin(2 * np.pi * (y / rng.uniform(12, 40) + rng.random()))
     return shut + (wide - shut) * opening
 
@@ -168,18 +181,17 @@ def _curl(params: GroomParams, rng) -> _Curl:
 
 
 def _guide(y: np.ndarray, curl: _Curl, params: GroomParams, rng) -> np.ndarray:
-    """x, z (n, 2) mm of a clump's guide over the heights y (n,)."""
-    radius = params.lock_radius_mm
+    """x, z (n, 2) mm of a clump's guide about its centre, over the heights y (n,)."""
     if params.style == "straight":
-        return 0.72 * radius * _disc(1, rng) + _wander(y, 0.06, (10, 40), rng)
+        return _wander(y, 0.06, (10, 40), rng)
     size = curl.radius_mm * rng.uniform(0.8, 1.2)
     phase = 2 * np.pi * y / (curl.turn_mm * rng.uniform(0.95, 1.05)) + curl.phase + rng.normal(0, 0.4)
     phase = phase + _wander(y, 0.06, (8, 20), rng)[:, 0]
     if params.style == "wavy":
         wave = size * np.stack([np.cos(curl.towards) * np.cos(phase), np.sin(curl.towards) * np.cos(phase + 0.6)], -1)
-        return 0.6 * radius * _disc(1, rng) + wave + _wander(y, 0.05, (10, 30), rng)
+        return wave + _wander(y, 0.05, (10, 30), rng)
     ringlet = size * np.stack([np.cos(phase), curl.turning * np.sin(phase)], -1)
-    return 0.45 * radius * _disc(1, rng) + ringlet + _wander(y, 0.04, (10, 30), rng)
+    return ringlet + _wander(y, 0.04, (10, 30), rng)
 
 
 def _leaving(y: np.ndarray, params: GroomParams, rng) -> np.ndarray:

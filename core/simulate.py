@@ -49,8 +49,8 @@ class Scale:
 
 
 SCALES = {
-    "tiny": Scale(210, 150, 12, 2.0, 24, 1.4, 4),  # seconds
-    "small": Scale(300, 240, 24, 3.0, 110, 2.6, 8),  # a minute
+    "tiny": Scale(180, 150, 16, 1.8, 24, 1.5, 4),  # seconds
+    "small": Scale(300, 240, 24, 3.0, 100, 2.8, 8),  # a minute
     "medium": Scale(420, 420, 24, 6.0, 340, 4.6, 24),  # minutes
     "paper": Scale(1462, 2193, 24, 37.5, 3000, 18.0, 360),  # hours: the capture of the paper, sec. 3
 }
@@ -86,9 +86,9 @@ class Look:
 
 
 LOOKS = {
-    "straight": Look((0.60, 0.39, 0.21), 0.9, 1.6),  # medium brown
-    "wavy": Look((0.80, 0.62, 0.38), 0.6, 1.1),  # blond
-    "curls": Look((0.40, 0.25, 0.14), 1.4, 2.0),  # dark brown
+    "straight": Look((0.60, 0.39, 0.21), 0.9, 1.0),  # medium brown
+    "wavy": Look((0.80, 0.62, 0.38), 0.6, 0.7),  # blond
+    "curls": Look((0.40, 0.25, 0.14), 1.4, 1.2),  # dark brown
 }
 
 
@@ -166,7 +166,7 @@ def prepare(groom: Groom, rng, chord_error_mm: float = 0.0015) -> Hair:
         along = np.gradient(points, axis=0)[keep]
         tangents.append(along / np.linalg.norm(along, axis=1, keepdims=True))
         kept.append(keep + groom.offsets[i])
-        tints.append(rng.lognormal(0, 0.25) * (1 + 0.06 * _texture(points[keep, 1], rng)))
+        tints.append(rng.lognormal(0, 0.2) * (1 + 0.06 * _texture(points[keep, 1], rng)))
     fiber = np.repeat(np.arange(len(groom), dtype=np.int32), [len(k) for k in kept])
     kept = np.concatenate(kept)
     segments = np.flatnonzero(np.diff(fiber) == 0)
