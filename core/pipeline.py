@@ -200,13 +200,13 @@ def _work_folder(capture: Capture, out: Path, parameters: Parameters) -> Path:
 
 
 def captured_strands(grown: Grown, params: GrowParams, provenance: dict) -> Strands:
-    """The grown curves as strands. Confidence rises with the cameras that agreed on a point: 1 - exp(-cameras / 4)."""
+    """The grown curves as strands. Confidence rises with the evidence for a point: 1 - exp(-evidence / 4)."""
     return Strands(
         points_mm=grown.points_mm,
         offsets=grown.offsets,
         radius_mm=np.full(len(grown.points_mm), params.radius_mm, np.float32),
         kind=np.full(len(grown.offsets) - 1, CAPTURED, np.uint8),
-        confidence=(1 - np.exp(grown.cameras / -4.0)).astype(np.float32),
+        confidence=(1 - np.exp(grown.evidence / -4.0)).astype(np.float32),
         stops=grown.stops,
         provenance=provenance,
     )
