@@ -1,0 +1,286 @@
+"""Ridges of lines that were drawn: where they are, how they are turned, and that nothing else is one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from strandscope.core.ridges import BINS, RidgeParams, detect, estimate, gabor_bank, line_banks, response
+
+from .known import across, along, drawn_line, turn_between
+
+SIDE = 64
+MIDDLE = (SIDE - 1) / 2
+BOARD, HAIR, GRAIN = 0.06, 0.2, 0.004  # light of the background and of a hair above it, and the noise, in parts of white
+PAPER = RidgeParams("paper", low=0.03, high=0.08, offset=(-140 + 128) / (4095 - 128))
+OPERATORS = ["oriented", "paper"]
+
+
+def params_for(operator, planes=None):
+    return PAPER if operator == "paper" else estimate(some_lines(4)[0] if planes is None else planes, RidgeParams())
+
+
+def photograph(angle, through, rng, slope=0.0, grain=GRAIN, width_px=None, blur_px=0.5, height=HAIR):
+    width_px = rng.uniform(2.5, 3.0) if width_px is None else width_px
+    ramp = slope * (np.arange(SIDE) / SIDE - 0.5)
+    plane = BOARD * (1 + ramp) + drawn_line((SIDE, SIDE), angle, through, width_px, blur_px, height)
+    return np.float32(plane + rng.normal(0, grain, plane.shape))
+
+
+def some_lines(count, slope=0.0, grain=GRAIN, seed=0):
+    """Photographs, and the angle and a point of the line in each: all angles, and places anywhere between pixel centres."""
+    rng = np.random.default_rng(seed)
+    known = [(np.pi * (i + rng.random()) / count, tuple(MIDDLE + rng.uniform(-0.5, 0.5, 2))) for i in range(count)]
+    return [photograph(*line, rng, slope, grain) for line in known], known
+
+
+def far_from_the_rim(ridges, angle, through, reach=18):
+    """(place along, distance across) of the ridge pixels on the middle part of a line, and which these are."""
+    s, x = along(angle, through, ridges.col, ridges.row), across(angle, through, ridges.col, ridges.row)
+    return s, x, np.abs(s) < reach
+
+
+# ---- where and how -----------------------------------------------------------------------------------------------------
+
+# Mean distance (px) from the line, and mean turn (degrees): measured 0.02 to 0.03 and 0.5 (oriented), 0.04 and 0.35 (paper).
+# What remains is grain, 2 % of the hair's light here, and that the peak between bins is no parabola. Half a pixel would be 0.3.
+PLACE_PX = {"oriented": 0.05, "paper": 0.07}
+TURN_DEG = 1.0
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.6])
+@pytest.mark.parametrize("operator", OPERATORS)
+def test_a_line_is_found_where_it_is_and_as_it_is_turned(operator, slope):
+    planes, known = some_lines(36, slope)
+    params = params_for(operator, planes[:8] if operator == "oriented" else None)
+    places, turns, signed, counts = [], [], [], []
+    for plane, (angle, through) in zip(planes, known, strict=True):
+        ridges = detect(plane, params)
+        _, x, here = far_from_the_rim(ridges, angle, through)
+        assert np.abs(x[here]).max() < 1.0  # nothing beside the line
+        places.append(np.abs(x[here]).mean())
+        signed.append(x[here].mean())
+        turns.append(np.degrees(np.abs(turn_between(ridges.angle[here], angle))).mean())
+        counts.append(here.sum() / (36 * max(abs(np.cos(angle)), abs(np.sin(angle)))))
+        assert np.all((ridges.angle >= 0) & (ridges.angle < np.pi + 1e-6))
+    assert np.mean(places) < PLACE_PX[operator]
+    assert np.mean(turns) < TURN_DEG
+    # the slope of the background alone moves the top by 0.01 px
+    assert abs(np.mean(signed)) < 0.03
+    # one pixel wide and whole: a feature a row (or column), some more where two pixels are as near to the crest
+    assert 0.95 < np.mean(counts) < 1.45
+    # the paper's own has breaks where the line runs between two pixels that are alike
+    assert min(counts) > (0.95 if operator == "oriented" else 0.6)
+
+
+TOO_NARROW = pytest.mark.xfail(reason="a filter of sigma 0.7 px is too narrow for the pixels and for hair of 3 px and more: 3 to 4 degrees")
+
+
+@pytest.mark.parametrize("width_px", [2.0, 2.5, pytest.param(3.0, marks=TOO_NARROW), pytest.param(3.5, marks=TOO_NARROW)])
+@pytest.mark.parametrize("turned_deg", [0.0, 90.0])
+def test_hair_along_the_rows_or_columns_is_not_taken_for_slanted(turned_deg, width_px):
+    """Most hair hangs. There, the whole of a filter samples the hair at one place between the pixels, and answers less than
+    its neighbours on either side do where it is too narrow for that."""
+    angle = np.radians(turned_deg)
+    for shift in (0.0, 0.2, 0.4):
+        through = (MIDDLE + 0.5 + shift, MIDDLE + 0.5 + shift)
+        plane = np.float32(BOARD + drawn_line((SIDE, SIDE), angle, through, width_px, rounded=True))
+        ridges = detect(plane, estimate([plane], RidgeParams()))
+        _, x, here = far_from_the_rim(ridges, angle, through)
+        assert here.sum() >= 34
+        assert np.abs(x[here]).mean() < 0.12
+        assert np.degrees(np.abs(turn_between(ridges.angle[here], angle))).mean() < 1.0
+
+
+def test_a_chain_is_whole():
+    """Steep and flat lines leave a feature in every row or column they cross."""
+    rng = np.random.default_rng(2)
+    for turned_deg in (12.0, 45.0, 78.0, 101.0, 169.0):
+        angle, through = np.radians(turned_deg), (MIDDLE, MIDDLE)
+        plane = photograph(angle, through, rng, grain=0.0)
+        ridges = detect(plane, params_for("oriented", [plane]))
+        counted = np.rint(ridges.row if 45 < turned_deg < 135 else ridges.col)
+        assert set(range(15, 49)) <= set(counted)
+
+
+def test_ridges_are_sorted_and_within_half_a_pixel_of_theirs():
+    planes, _ = some_lines(3)
+    params = params_for("oriented", planes)
+    for plane in planes:
+        ridges = detect(plane, params)
+        rows, cols = np.nonzero(response(plane, params))
+        assert len(rows) == len(ridges.col)
+        # the way to the crest is at most 0.6 px in the larger of column and row
+        assert np.abs(ridges.col - cols).max() <= 0.61
+        assert np.abs(ridges.row - rows).max() <= 0.61
+        assert np.allclose(ridges.strength, response(plane, params)[rows, cols])
+
+
+# ---- light and grain ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_the_same_hair_in_other_light_gives_the_same_ridges(factor):
+    planes, _ = some_lines(6)
+    bright = [np.float32(factor) * plane for plane in planes]
+    params, others = estimate(planes, RidgeParams()), estimate(bright, RidgeParams())
+    assert others.offset == pytest.approx(factor * params.offset, rel=1e-3)
+    for plane, scaled in zip(planes, bright, strict=True):
+        a, b = detect(plane, params), detect(scaled, others)
+        assert len(a.col) == pytest.approx(len(b.col), abs=2)  # float32 at a threshold
+        if len(a.col) == len(b.col):
+            for name in ("col", "row", "strength"):
+                assert np.allclose(getattr(a, name), getattr(b, name), atol=2e-3)
+
+
+def test_an_offset_that_is_given_is_kept_or_estimated_alone():
+    planes, _ = some_lines(1)
+    assert estimate(planes, RidgeParams(low=0.2)).low == 0.2
+    params = estimate(planes, RidgeParams())
+    a, b = detect(planes[0], params), detect(planes[0], RidgeParams())
+    assert np.array_equal(a.col, b.col)
+    assert len(detect(planes[0], replace(params, offset=1e3)).col) == 0
+
+
+@pytest.mark.parametrize("operator", OPERATORS)
+def test_grain_makes_no_ridges(operator):
+    """Less than one in 10,000 pixels of evenly lit background in a photograph whose hair is well lit."""
+    params, rng = params_for(operator), np.random.default_rng(3)
+    plane = np.float32(BOARD + rng.normal(0, GRAIN, (400, 400)))
+    # the paper's c of -12/3967 is made for its camera and hair; its thresholds are those that suit grain of 2 %
+    level = plane if operator == "oriented" else plane + np.float32(HAIR - BOARD)
+    assert len(detect(level, params).col) < 16
+
+
+@pytest.mark.parametrize("operator", OPERATORS)
+def test_black_makes_no_ridges(operator):
+    params = params_for(operator)
+    assert len(detect(np.zeros((40, 40), np.float32), params).col) == 0
+    assert len(detect(np.full((40, 40), 0.3, np.float32), params).col) == 0
+
+
+@pytest.mark.parametrize("operator", OPERATORS)
+def test_hair_out_of_focus_is_weak_or_gone(operator):
+    params, rng = params_for(operator), np.random.default_rng(4)
+    strongest = []
+    for blur_px in (0.5, 1.5, 3.0, 8.0):  # a cone of 10 degrees blurs by about 1.5 px at 0.6 mm, 8 px at 3 mm
+        plane = photograph(1.3, (MIDDLE, MIDDLE), rng, grain=0.0, width_px=2.8, blur_px=blur_px)
+        strongest.append(response(plane, params)[16:48, 16:48].max(initial=0))
+    assert strongest[0] > strongest[1] > strongest[2]
+    assert strongest[3] == 0
+    assert strongest[2] < 0.35 * strongest[0]
+
+
+@pytest.mark.parametrize("operator", OPERATORS)
+def test_the_rim_of_a_photograph_is_no_ridge(operator):
+    """A photograph ends where its light does not; nothing is made up there, and small ones are no error."""
+    params = params_for(operator)
+    plane = np.float32(0.05 + 0.2 * (np.arange(60) > 30) + np.zeros((50, 1)))  # a step: an edge, no ridge
+    ridges = detect(plane, params)
+    assert np.all(np.abs(ridges.col - 30.5) < 4)
+    assert len(detect(np.full((60, 60), 0.5, np.float32)[:, :30], params).col) == 0
+    for shape in ((17, 40), (40, 17)):
+        assert len(detect(np.full(shape, 0.2, np.float32), params).col) == 0
+
+
+def test_hysteresis_keeps_weak_pixels_that_hang_on_strong_ones():
+    rng = np.random.default_rng(5)
+    # a hair that grows dim downwards
+    plane = photograph(np.pi / 2 - 0.1, (MIDDLE, MIDDLE), rng, grain=0.0)
+    plane = np.float32(BOARD + (plane - BOARD) * np.linspace(1, 0, SIDE)[:, None])
+    params = params_for("oriented")
+    strength = response(plane, replace(params, high=params.low))
+    top = float(strength.max())
+    params = replace(params, low=0.2 * top, high=0.8 * top)
+    kept = response(plane, params)
+    rows = np.nonzero(kept.max(axis=1))[0]
+    assert kept[kept > 0].min() < 0.4 * top  # weak ones too
+    assert np.all(kept[kept > 0] >= params.low)
+    assert np.array_equal(rows, np.arange(rows[0], rows[-1] + 1))  # in one piece
+    assert response(plane, replace(params, high=1.01 * top)).max() == 0
+
+
+# ---- the banks, and what is done with them ------------------------------------------------------------------------------
+
+
+def test_the_bank_is_equation_1():
+    """Up to the mean, which is taken out: G(u, v) = exp(-(u~^2 + v~^2) / 2) cos(2 pi u~ / 3), the hair along v~."""
+    bank = gabor_bank()
+    assert bank.shape == (32, 7, 7)
+    v, u = np.mgrid[3:-4:-1, -3:4]
+    for k in range(BINS):
+        hair = k * np.pi / 32
+        phi = hair - np.pi / 2  # u~ = u cos phi + v sin phi is the coordinate across the hair
+        across_hair = u * np.cos(phi) + v * np.sin(phi)
+        along_hair = -u * np.sin(phi) + v * np.cos(phi)
+        wanted = np.exp(-0.5 * (across_hair**2 + along_hair**2)) * np.cos(2 * np.pi * across_hair / 3.0)
+        assert np.abs((bank[k] - bank[k].mean()) - (wanted - wanted.mean())).max() < 1e-6
+        assert abs(bank[k].sum()) < 1e-5
+
+
+def test_line_filters_answer_one_to_their_own_line_and_none_to_a_plane():
+    for across_px, along_px in ((1.0, 3.0), (1.2, 4.0)):
+        even, odd = (bank.astype(float) for bank in line_banks(across_px, along_px))
+        half = even.shape[1] // 2
+        v, u = np.mgrid[half : -half - 1 : -1, -half : half + 1]
+        for k in range(BINS):
+            angle = k * np.pi / BINS
+            x = -u * np.sin(angle) + v * np.cos(angle)
+            assert np.sum(even[k] * np.exp(-(x**2) / (2 * across_px**2))) == pytest.approx(1, abs=2e-2)
+            assert abs(np.sum(even[k])) < 1e-5
+            assert abs(np.sum(even[k] * u)) < 1e-4
+            # a line 0.3 px off: the odd filter over the even one is the way to it (Steger 1998), to a tenth of a pixel
+            shifted = np.exp(-((x - 0.3) ** 2) / (2 * across_px**2))
+            assert np.sum(odd[k] * shifted) / np.sum(even[k] * shifted) == pytest.approx(0.3, abs=0.1)
+            assert np.allclose(even[k], even[k][::-1, ::-1], atol=1e-6)
+            assert np.allclose(odd[k], -odd[k][::-1, ::-1], atol=1e-6)
+
+
+def plain_paper(plane, params):
+    """M' of section 4.1 pixel by pixel, by scipy's correlation and interpolation: the oracle of the kernel."""
+    blurred = ndimage.gaussian_filter(plane, params.blur_px, truncate=4.0)
+    values = np.stack([ndimage.correlate(blurred, f) for f in gabor_bank()])
+    best = values.argmax(axis=0)
+    rows, cols = np.mgrid[: plane.shape[0], : plane.shape[1]]
+    middle, left, right = (values[(best + k) % BINS, rows, cols] for k in (0, -1, 1))
+    angle = (best + 0.5 * (left - right) / (left - 2 * middle + right)) * np.pi / BINS
+    sides = [ndimage.map_coordinates(blurred, [rows - s * np.cos(angle), cols - s * np.sin(angle)], order=1) for s in (1, -1)]
+    highest = np.maximum(*sides)
+    return np.where(highest + params.offset > 0, (blurred - highest) / (highest + params.offset), 0)
+
+
+def test_the_relative_peak_is_that_of_section_4_1():
+    rng = np.random.default_rng(6)
+    plane = np.float32(0.05 + 0.1 * ndimage.gaussian_filter(rng.random((40, 48)), 1.0))
+    params = RidgeParams("paper", low=0.004, high=0.004, offset=0.01)
+    found, wanted = response(plane, params), plain_paper(plane.astype(float), params)
+    inside = np.s_[5:-5, 5:-5]
+    found, wanted = found[inside], np.where(wanted[inside] >= params.low, wanted[inside], 0)
+    assert (wanted > 0).sum() > 50
+    # the kernel's angle between the bins follows more than three of them: M1 and M2 are looked up a little aside
+    assert np.mean((found > 0) == (wanted > 0)) > 0.97
+    both = (found > 0) & (wanted > 0)
+    assert np.abs(found - wanted)[both].max() < 0.1 * wanted.max()
+    assert np.median(np.abs(found - wanted)[both]) < 0.02 * np.median(wanted[both])
+
+
+def test_a_c_that_leaves_no_light_makes_no_ridge():
+    """Table 1 counts c with the black level in it: where Mmax + c is 0 or less there is no ridge, however clear the line."""
+    plane = photograph(1.0, (MIDDLE, MIDDLE), np.random.default_rng(7), grain=0.0)
+    assert len(detect(plane, PAPER).col) > 40
+    assert len(detect(plane, replace(PAPER, offset=-1.0)).col) == 0
+
+
+def test_strength_is_the_filters_answer_over_the_light():
+    """The matrix product over folded rows is a correlation with each filter; its strongest answer over c + the light."""
+    rng = np.random.default_rng(8)
+    plane = np.float32(0.1 + 0.05 * ndimage.gaussian_filter(rng.normal(size=(44, 50)), 1.0))
+    params = RidgeParams(low=0.001, high=0.001, offset=0.07)
+    even, _ = line_banks(params.across_px, params.along_px)
+    strongest = np.stack([ndimage.correlate(plane.astype(float), f.astype(float)) for f in even]).max(axis=0)
+    light = ndimage.gaussian_filter(plane.astype(float), 2.0 * params.along_px)
+    found = response(plane, params)
+    assert (found > 0).sum() > 100
+    assert np.allclose(found[found > 0], (strongest / (params.offset + light))[found > 0], rtol=1e-3, atol=1e-5)
+    assert found[0].max() == found[:, 0].max() == 0
