@@ -573,8 +573,8 @@ def plan(out: Path, params: SimulateParams) -> Capture:
         raise StrandscopeError(f"fibers is {params.fibers}; expected 1 or more")
     scale = SCALES[params.scale]
     optics = Optics(params.working_distance_mm, params.pitch_mm, (scale.columns - 1) / 2, (scale.rows - 1) / 2, params.aperture_cone_deg)
-    count = 2 * int(scale.half_range_mm / params.step_mm + 1e-6) + 1
-    positions = tuple(round((i - count // 2) * params.step_mm, 6) for i in range(count))
+    count = round(2 * scale.half_range_mm / params.step_mm) + 1
+    positions = tuple(round((i - (count - 1) / 2) * params.step_mm, 6) for i in range(count))
     angles = np.arange(scale.angles) * 360 / scale.angles
     sweeps = tuple(Sweep(float(angle), positions, tuple(f"sweep_{i:03d}/img_{j:04d}.dng" for j in range(count))) for i, angle in enumerate(angles))
     turns = tuple(float(i * 360 / scale.turntable) for i in range(scale.turntable))

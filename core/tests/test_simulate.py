@@ -429,7 +429,8 @@ def test_wrong_parameters_leave_no_folder(tmp_path, change):
 
 def test_the_paper_scale_is_that_of_the_paper():
     capture = module.plan("out", SimulateParams(scale="paper"))
-    assert sum(len(s.files) for s in capture.sweeps) == 24 * 375  # the paper has 376; ours have a photograph at d = 0
+    assert sum(len(s.files) for s in capture.sweeps) == 9024
+    assert (capture.sweeps[0].positions_mm[0], capture.sweeps[0].positions_mm[-1]) == (-37.5, 37.5)
     assert aperture_radius_mm(capture.optics) == pytest.approx(28.87, abs=0.01)
     assert module.stopped_cone_deg(SimulateParams()) == pytest.approx(1.754, abs=0.001)
 
