@@ -4,7 +4,7 @@ The projection is written here a second time, from the definition of axes and si
 a sign that is wrong there, or in a kernel, does not cancel out.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import erf
@@ -91,6 +91,11 @@ class Seen:
     clutter: int = 0  # features a sweep that belong to nothing
     share: float = 1.0  # of the features that are kept
     seed: int = 0
+    distance_mm: float = 330.0  # of the lens from the plane of focus
+
+    @property
+    def optics(self) -> Optics:
+        return replace(OPTICS, working_distance_mm=self.distance_mm)
 
 
 def in_camera(points_mm, angle_deg):
@@ -114,7 +119,7 @@ def _sweep(curves, k, seen, hidden, rng) -> SweepFeatures:
     angle_deg = seen.turn_deg * k / seen.angles
     photographs = []
     for d in POSITIONS_MM:
-        found = [_crossings(c, ~hidden(c, k), angle_deg, d, seen.reach_mm) for c in curves]
+        found = [_crossings(c, ~hidden(c, k), angle_deg, d, seen) for c in curves]
         col, row, angle, strength = np.concatenate([*found, _clutter(seen, rng)], axis=1)
         col, row = col + rng.normal(0, seen.noise_px, len(col)), row + rng.normal(0, seen.noise_px, len(col))
         angle = (angle + np.radians(rng.normal(0, seen.noise_deg, len(col)))) % np.pi
@@ -128,10 +133,10 @@ def _clutter(seen, rng):
     return rng.uniform(low, high, (seen.clutter // len(POSITIONS_MM), 4)).T
 
 
-def _crossings(points, shown, angle_deg, d, reach_mm):
+def _crossings(points, shown, angle_deg, d, seen):
     """(4, m): column, row, angle and strength of a curve in the photograph at d."""
     u, v, w = in_camera(points, angle_deg)
-    scale = OPTICS.working_distance_mm / (OPTICS.working_distance_mm + d - w)
+    scale = seen.distance_mm / (seen.distance_mm + d - w)
     col, row = OPTICS.axis_col_px + u * scale / OPTICS.pitch_mm, OPTICS.axis_row_px - v * scale / OPTICS.pitch_mm
     steps_col, steps_row = np.diff(col), np.diff(row)
     steep = np.abs(steps_row) >= np.abs(steps_col)
@@ -139,7 +144,7 @@ def _crossings(points, shown, angle_deg, d, reach_mm):
     step = np.where(steep, steps_row, steps_col)
     crossed = np.where(step > 0, np.ceil(counted), np.floor(counted))
     t = (crossed - counted) / np.where(step == 0, np.inf, step)
-    at = np.flatnonzero((t < 1) & (step != 0) & (np.abs(w[:-1] - d) <= reach_mm) & shown[:-1])
+    at = np.flatnonzero((t < 1) & (step != 0) & (np.abs(w[:-1] - d) <= seen.reach_mm) & shown[:-1])
     t, off = t[at], (w[at] - d) / 0.3
     return np.stack(
         [col[at] + t * steps_col[at], row[at] + t * steps_row[at], np.arctan2(-steps_row[at], steps_col[at]) % np.pi, 0.5 * np.exp(-0.5 * off**2)]
