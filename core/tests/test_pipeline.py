@@ -16,7 +16,7 @@ from strandscope.core.strands import CAPTURED, INFILL, load_strands
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
-    """Four fibers from 12 angles: the folder of the capture."""
+    """Four fibers: the folder of the capture."""
     folder = tmp_path_factory.mktemp("simulated") / "capture"
     simulate(folder, SimulateParams(scale="tiny", fibers=4))
     return folder
@@ -24,9 +24,9 @@ def capture(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def few(capture):
-    """Every second angle of it: a capture.json beside the other, for runs that need no good result."""
+    """Six of its angles: a capture.json beside the other, for runs that need no good result."""
     head = json.loads((capture / "capture.json").read_text(encoding="utf-8"))
-    head["sweeps"] = head["sweeps"][::2]
+    head["sweeps"] = head["sweeps"][:: len(head["sweeps"]) // 6][:6]
     (capture / "few.json").write_text(json.dumps(head), encoding="utf-8")
     return capture / "few.json"
 
