@@ -31,7 +31,8 @@ def atomic(path: Path) -> Iterator[Path]:
 
 def explain(error: OSError, path: Path) -> StrandscopeError:
     """The error of the operating system for ``path`` in words."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+    cut_short = error.errno is None and "requested and" in str(error)  # how numpy tells that a write ended early
+    if cut_short or error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return StrandscopeError(f"{path}: the disk is full; nothing was written there, free some space and run again")
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return StrandscopeError(f"{path}: cannot be written here ({error.strerror}); choose a folder of your own")
