@@ -213,7 +213,7 @@ def _prepare(scene: bpy.types.Scene, resolution: tuple[int, int], samples: int) 
     scene.render.film_transparent = True
     scene.render.image_settings.file_format = "OPEN_EXR"
     scene.render.image_settings.color_mode, scene.render.image_settings.color_depth = "RGBA", "32"
-    scene.cycles.samples, scene.cycles.use_adaptive_sampling, scene.cycles.use_denoising = samples, False, False
+    scene.cycles.samples, scene.cycles.use_adaptive_sampling, scene.cycles.use_denoising = samples, False, True
 
 
 def _render_frame(scene: bpy.types.Scene, out: Path, index: int, count: int, progress: Progress) -> None:

@@ -26,6 +26,7 @@ REACH = 1.25  # fibers farther than this times the tolerance are not considered
 ON_FIBER_MM, FOLLOWED_MM = 0.3, 0.5  # shortest run that counts as being on a fiber, and as following it
 
 SHARP_MM = 0.1  # blur, a hair's width, up to which a point counts as in focus
+FRONT_MM, CELL_MM = 0.3, 0.15  # a curve this far behind another in a square of this size is taken as hidden
 PANEL_PX = 840  # a photograph is enlarged by a whole factor until it is at least as wide or tall as this
 SMOOTH = 3  # samples a pixel and axis when lines are drawn
 CAPTION_PX = 26
@@ -319,8 +320,8 @@ def depth_of_field_mm(optics: Optics) -> float:
 def choose_shot(
     capture: Capture, strands: Strands, sweep: int | None = None, angle_deg: float | None = None, position_mm: float | None = None
 ) -> Shot:
-    """The photograph with the most curve in focus, among those of a sweep (by number from 0, or nearest angle) and nearest
-    to a position where these are given. Raises StrandscopeError for a sweep that is not there."""
+    """The photograph with the most curve in focus and in front, among those of a sweep (by number from 0, or nearest angle)
+    and nearest to a position where these are given. Raises StrandscopeError for a sweep that is not there."""
     if sweep is not None and not 0 <= sweep < len(capture.sweeps):
         raise StrandscopeError(f"{capture.folder}: there is no sweep {sweep}; expected 0 … {len(capture.sweeps) - 1}")
     if sweep is None and angle_deg is not None:
@@ -330,12 +331,21 @@ def choose_shot(
     half = depth_of_field_mm(capture.optics) / 2
     for k in range(len(capture.sweeps)) if sweep is None else [sweep]:
         positions = np.asarray(capture.sweeps[k].positions_mm)
-        depth = np.sort(camera_points(strands.points_mm, capture.sweeps[k].angle_deg)[:, 2])
+        depth = np.sort(_foremost(camera_points(strands.points_mm, capture.sweeps[k].angle_deg)))
         in_focus = np.searchsorted(depth, positions + half) - np.searchsorted(depth, positions - half)
         i = int(np.argmax(in_focus) if position_mm is None else np.argmin(np.abs(positions - position_mm)))
         if in_focus[i] > most:
             best, most = Shot(k, i), in_focus[i]
     return best
+
+
+def _foremost(points_mm: np.ndarray) -> np.ndarray:
+    """w (n,) of the points (N, 3) of a camera frame with no other more than FRONT_MM before them, in squares of CELL_MM."""
+    square = np.floor(points_mm[:, :2] / CELL_MM).astype(np.int64)
+    _, cell = np.unique(square, axis=0, return_inverse=True)
+    front = np.full(cell.max(initial=-1) + 1, -np.inf)
+    np.maximum.at(front, cell, points_mm[:, 2])
+    return points_mm[points_mm[:, 2] > front[cell] - FRONT_MM, 2]
 
 
 def in_focus(capture: Capture, strands: Strands, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
