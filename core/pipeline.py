@@ -127,16 +127,11 @@ def _processes(workers: int) -> Iterator:
     if workers == 1:
         yield map
         return
-    limits = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-    before = {name: os.environ.get(name) for name in limits}
-    os.environ.update(limits)  # for the children that spawn below; one thread each
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_end_with_parent)
     try:
         yield lambda function, jobs: pool.map(function, jobs, chunksize=4)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def _end_with_parent() -> None:
@@ -268,11 +263,14 @@ def _threads(count: int) -> Iterator[None]:
 
 
 def write_toml(path: Path, parameters: Parameters) -> None:
-    """Write parameters as TOML, a table a stage; what is to be estimated is left out."""
+    """Write parameters as TOML, a table a stage; what is to be estimated is left out, and ``infill = false`` is no infill."""
     import tomli_w
 
+    tables = _without_none(asdict(parameters))
+    if parameters.infill is None:
+        tables = {"infill": False} | tables
     with atomic(path) as part:
-        part.write_text(tomli_w.dumps(_without_none(asdict(parameters))), encoding="utf-8")
+        part.write_text(tomli_w.dumps(tables), encoding="utf-8")
 
 
 def read_toml(path: Path) -> Parameters:
@@ -283,7 +281,9 @@ def read_toml(path: Path) -> Parameters:
         raise StrandscopeError(f"{path}: not found; expected a TOML file with parameters") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise StrandscopeError(f"{path}: not valid TOML: {error}") from error
-    return _filled(Parameters(), tables, path, "")
+    without = tables.get("infill") is False
+    parameters = _filled(Parameters(), {k: v for k, v in tables.items() if not (without and k == "infill")}, path, "")
+    return replace(parameters, infill=None) if without else parameters
 
 
 def _without_none(values: dict) -> dict:
@@ -299,7 +299,7 @@ def _filled(record, values: dict, path: Path, where: str):
             raise StrandscopeError(f"{path}: {where}{name} is not a parameter; expected one of {', '.join(known)}")
         old = known[name]
         if is_dataclass(old):
-            changes[name] = _filled(old, value if isinstance(value, dict) else {"?": value}, path, f"{where}{name}.")
+            changes[name] = _filled(old, value, path, f"{where}{name}.") if isinstance(value, dict) else _wrong(path, where + name, value, "a table")
         elif isinstance(old, tuple):
             good = isinstance(value, list) and len(value) == len(old) and all(_is_number(v) for v in value)
             changes[name] = tuple(map(float, value)) if good else _wrong(path, where + name, value, f"{len(old)} numbers")

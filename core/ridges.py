@@ -19,6 +19,7 @@ from functools import lru_cache
 import numpy as np
 from numba import njit
 from scipy import ndimage
+from threadpoolctl import ThreadpoolController
 
 BINS = 32  # orientations of a bank, over 180 degrees
 LIGHT_TO_OFFSET = 1.2  # c of the oriented operator, in parts of the light around clear hairs
@@ -36,6 +37,7 @@ class RidgeParams:
     blur_px: float = 1.0  # paper: sigma of the Gaussian before all else
     across_px: float = 0.7  # oriented: sigma of the line filter across the hair
     along_px: float = 4.0  # oriented: sigma of the line filter along the hair
+    turn_px: float = 0.9  # oriented: sigma across of the filter that measures the angle; a narrow one misjudges upright hair
 
 
 @dataclass(frozen=True)
@@ -95,13 +97,24 @@ def _measure(plane, params):
     plane = np.ascontiguousarray(plane, np.float32)
     if params.offset is None:
         params = estimate([plane], params)
+    with _blas().limit(limits=1):  # a row is too little for two threads, which wait for each other ten times as long
+        return _measure_alone(plane, params)
+
+
+@lru_cache(maxsize=1)
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+def _measure_alone(plane, params):
     if params.operator == "paper":
         blurred = ndimage.gaussian_filter(plane, params.blur_px, truncate=4.0)
         bank = gabor_bank()
         return _relative_peaks(blurred, _folded(bank), bank.shape[1] // 2, np.float32(params.offset), np.float32(params.low))
     even, odd = line_banks(params.across_px, params.along_px)
+    wide, _ = line_banks(params.turn_px, params.along_px)
     light = ndimage.gaussian_filter(plane, 2.0 * params.along_px)
-    return _line_peaks(plane, _folded(even), odd, light, np.float32(params.offset), np.float32(params.low))
+    return _line_peaks(plane, _folded(even), odd, wide, light, np.float32(params.offset), np.float32(params.low))
 
 
 # ---- banks -----------------------------------------------------------------------------------------------------------
@@ -229,7 +242,40 @@ def _relative_peaks(blurred, filters, half, offset, low):
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _line_peaks(plane, filters, odd, light, offset, low):
+def _answer(plane, y, x, weights):
+    """Response of one filter (k, k) at a pixel."""
+    size = weights.shape[0]
+    half = size // 2
+    total = np.float32(0)
+    for j in range(size):
+        line, row = plane[y - half + j, x - half : x + half + 1], weights[j]
+        for i in range(size):
+            total += line[i] * row[i]
+    return total
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _finer(plane, y, x, bank, best):
+    """(bin, fraction of a bin) of the strongest filter of a bank (B, k, k), climbing from bin ``best``, by a parabola."""
+    bins = len(bank)
+    left, middle, right = (
+        _answer(plane, y, x, bank[(best - 1) % bins]),
+        _answer(plane, y, x, bank[best]),
+        _answer(plane, y, x, bank[(best + 1) % bins]),
+    )
+    for _ in range(4):
+        if left > middle and left >= right:
+            best = (best - 1) % bins
+            left, middle, right = _answer(plane, y, x, bank[(best - 1) % bins]), left, middle
+        elif right > middle:
+            best = (best + 1) % bins
+            left, middle, right = middle, right, _answer(plane, y, x, bank[(best + 1) % bins])
+    bend = left - 2 * middle + right
+    return best, np.float32(0.5) * (left - right) / bend if bend < 0 else np.float32(0)
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _line_peaks(plane, filters, odd, wide, light, offset, low):
     """Crests of the line filters' response over (offset + light), their angle and shift; three (H, W) arrays."""
     height, width = plane.shape
     size = odd.shape[1]
@@ -242,21 +288,18 @@ def _line_peaks(plane, filters, odd, light, offset, low):
         _fold_row(plane, y, half, sums)
         np.dot(filters, sums, values)
         for x in range(half, width - half):
-            best, fraction, value = _strongest(values, x - half)
+            best, _, value = _strongest(values, x - half)
             if value < low * (offset + light[y, x]):
                 continue
-            slant = np.float32(0)
-            for j in range(size):
-                line, weights = plane[y - half + j, x - half : x + half + 1], odd[best, j]
-                for i in range(size):
-                    slant += line[i] * weights[i]
-            step = slant / value
+            step = _answer(plane, y, x, odd[best]) / value
             phi = best * np.pi / filters.shape[0]
             if abs(step) * max(abs(np.sin(phi)), abs(np.cos(phi))) > 0.6:  # the crest belongs to another pixel
                 continue
-            angle[y, x], sign = _turned(best, fraction, filters.shape[0])
+            turned, fraction = _finer(plane, y, x, wide, best)
+            angle[y, x], _ = _turned(turned, fraction, filters.shape[0])
+            # the way to the crest along the normal of the bin, told along that of the angle
             strength[y, x] = value / (offset + light[y, x])
-            shift[y, x] = sign * step
+            shift[y, x] = step * np.cos(phi - angle[y, x])
     return strength, angle, shift
 
 

@@ -201,7 +201,7 @@ def test_presets_are_table_1():
     assert preset() == preset("auto") == preset("straight")
 
 
-@pytest.mark.parametrize("parameters", [Parameters(), preset("wavy"), preset("curls", "paper")])
+@pytest.mark.parametrize("parameters", [Parameters(), Parameters(infill=None), preset("wavy"), preset("curls", "paper")])
 def test_toml_gives_the_parameters_back(tmp_path, parameters):
     write_toml(tmp_path / "p.toml", parameters)
     assert read_toml(tmp_path / "p.toml") == parameters
