@@ -1,10 +1,12 @@
 """Strands in Blender without a window: a Blender file of them, and renderings beside the photographs."""
 
+import errno
 import hashlib
 import json
 import math
 import os
 import re
+import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -28,6 +30,8 @@ from . import material, rig_scene
 SWEEP_F_NUMBER = 2.8  # at which sweeps are taken, with the cone of rays that the capture tells (sec. 3)
 FRAMES_VERSION = 2  # of what a frame shows; a change renders existing frames again
 PROGRESS_STAGE = "rendering"
+EMPTY_BLEND_BYTES = 500_000  # of a Blender file without hair, nearly
+EXR_HEAD_BYTES = 65_536  # of a frame, at most, beside its pixels
 
 
 @dataclass(frozen=True)
@@ -115,9 +119,11 @@ def blend(strands_path: Path, out_blend: Path, capture: Capture | None = None) -
     _look_at(strands)
     with atomic(out_blend) as part:
         try:
-            with _without_messages():
-                bpy.ops.wm.save_as_mainfile(filepath=str(part), compress=True, copy=True)
+            with _without_messages():  # not compressed: of a compressed file Blender does not notice when the disk is full
+                bpy.ops.wm.save_as_mainfile(filepath=str(part), compress=False, copy=True)
         except RuntimeError as error:
+            if shutil.disk_usage(part.parent).free < EMPTY_BLEND_BYTES + strands.points_mm.nbytes:  # Blender does not say it
+                raise OSError(errno.ENOSPC, "no room for a Blender file") from error
             raise StrandscopeError(f"{out_blend}: Blender could not save it ({' '.join(str(error).split())})") from error
     return out_blend
 
@@ -232,6 +238,7 @@ def _render_frame(scene: bpy.types.Scene, out: Path, index: int, count: int, pro
     bpy.app.handlers.render_stats.append(watch)
     try:
         with atomic(out) as part:
+            part.write_bytes(bytes(16 * scene.render.resolution_x * scene.render.resolution_y + EXR_HEAD_BYTES))  # Blender notices no full disk
             bpy.ops.render.render(scene=scene.name)
             bpy.data.images["Render Result"].save_render(str(part), scene=scene)
     except RuntimeError as error:

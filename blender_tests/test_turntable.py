@@ -1,6 +1,9 @@
 """Blender files and renderings, made without a window."""
 
 import dataclasses
+import os
+import shutil
+import subprocess
 
 import bpy
 import numpy as np
@@ -49,6 +52,38 @@ def test_blend_of_bad_strands_leaves_nothing(tmp_path, strands):
     with pytest.raises(StrandsError, match="points"):
         turntable.blend(tmp_path / "bad.npz", tmp_path / "out" / "hair.blend")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A function that gives a folder on a file system with so many bytes free. Skips the test where this user may not mount one."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(disk)]
+    if os.name != "posix" or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("cannot mount a small disk here")
+
+    def with_free(count):
+        (disk / "filler").write_bytes(bytes(shutil.disk_usage(disk).free - count // 4096 * 4096))
+        return disk
+
+    yield with_free
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.parametrize("free", [0, 8192, 300_000])
+def test_blend_on_a_full_disk_leaves_nothing(small_disk, strands_file, free):
+    disk = small_disk(free)
+    with pytest.raises(StrandscopeError, match=r"hair\.blend: the disk is full"):
+        turntable.blend(strands_file, disk / "hair.blend")
+    assert [path.name for path in disk.iterdir()] == ["filler"]
+
+
+def test_frames_on_a_full_disk_are_not_torn(small_disk, strands, capture):
+    disk = small_disk(16_384)
+    with pytest.raises(StrandscopeError, match=r"render_000\.exr: the disk is full"):
+        turntable.render_turntable(capture, strands, disk / "t.png", **QUICK)
+    assert sorted(path.name for path in disk.rglob("*")) == ["filler", "frames.json", "t_frames"]
 
 
 def test_blend_wants_a_blend(tmp_path, strands_file):
