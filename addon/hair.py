@@ -108,8 +108,9 @@ def describe(hair: bpy.types.Object) -> str:
     length = numbers["length_mm"]
     lines = [
         f"{numbers['curves']:,} captured, {numbers['infill_curves']:,} infill",
-        f"{length['mean']:.1f} mm long, the longest {length['longest']:.1f} mm",
-        f"{numbers['mean_curves_crossing_a_horizontal_plane']:.0f} side by side, {2 * numbers['mean_radius_mm']:.3f} mm thick",
+        f"Length {length['mean']:.1f} mm, at most {length['longest']:.1f} mm",
+        f"Thickness {2 * numbers['mean_radius_mm']:.3f} mm",
+        f"{numbers['mean_curves_crossing_a_horizontal_plane']:.0f} in a cross-section",
     ]
     return "\n".join(lines)
 

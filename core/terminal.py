@@ -20,6 +20,7 @@ class Reporter:
 
     def __init__(self):
         self._started = {}  # stage -> (time, done) of its first report
+        self._moving = {}  # stage -> (time, done) of the first that got further: what came before was getting ready
 
     def __call__(self, stage: str, done: float, total: float) -> None:
         """``done`` of ``total`` units of ``stage`` are finished."""
@@ -39,10 +40,12 @@ class Reporter:
         """No more reports will come."""
 
     def _rate(self, stage: str, done: float) -> float:
-        """Units of the stage a second since its first report, 0 while unknown."""
+        """Units of the stage a second since the first was ready, 0 while unknown."""
         now = time.monotonic()
-        started, first = self._started.setdefault(stage, (now, done))
-        return (done - first) / (now - started) if now > started else 0.0
+        if done <= self._started.setdefault(stage, (now, done))[1]:
+            return 0.0
+        since, first = self._moving.setdefault(stage, (now, done))
+        return (done - first) / (now - since) if now > since else 0.0
 
 
 class Lines(Reporter):
