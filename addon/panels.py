@@ -32,7 +32,7 @@ def _job(layout, context) -> None:
     job = context.window_manager.strandscope_job
     column = layout.column(align=True)
     row = column.row(align=True)
-    row.progress(factor=job.fraction, type="BAR", text=f"{job.stage} {100 * job.fraction:.0f} %")
+    row.progress(factor=job.fraction, type="BAR", text=f"{job.stage} {100 * job.fraction:.0f} %" if job.fraction else f"{job.stage} …")
     row.operator("strandscope.cancel", text="", icon="X")
     if job.remaining:
         column.label(text=job.remaining, icon="TIME")
