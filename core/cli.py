@@ -363,7 +363,9 @@ def reconstruct(session, capture, output, preset, params, method, infill, no_inf
         parameters = replace(parameters, infill=None)
     elif infill is not None:
         parameters = replace(parameters, infill=replace(parameters.infill, count=infill))
-    pipeline.reconstruct(capture, output, parameters, workers=workers, memory_bytes=memory, progress=session.report)
+    strands = pipeline.reconstruct(capture, output, parameters, workers=workers, memory_bytes=memory, progress=session.report)
+    captured = len(strands.captured)
+    session.report.show(f"{output}: {captured} captured curves, {len(strands) - captured} of infill")
     session.report.done(output)
 
 

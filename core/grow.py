@@ -20,7 +20,6 @@ was taken by one before; what is refused is tried again in the next pass. The re
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -39,20 +38,13 @@ from .features import (
 )
 from .geometry import project, slope, to_image, to_pixel, turn, turn_back
 from .progress import Progress, silent
+from .stops import Stop
 
 _turn, _turn_back, _slope, _to_pixel, _to_image, _project = (
     njit(turn), njit(turn_back), njit(slope), njit(to_pixel), njit(to_image), njit(project),
 )  # fmt: skip
 BATCH = 64  # seeds grown against the same observations; part of the result, not of the machine
 MAX_HITS = 2048  # features of one camera that one step looks at
-
-
-class Stop(IntEnum):
-    """Why growing ended at one end of a curve."""
-
-    LEFT_VOLUME = 1  # fewer than three cameras have the point in their field
-    UNOBSERVED = 2  # fewer than three cameras saw the hair, longer than can be bridged
-    TOO_LONG = 3  # the curve reached the longest length allowed
 
 
 @dataclass(frozen=True)

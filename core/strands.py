@@ -8,6 +8,7 @@ import numpy as np
 
 from .errors import StrandsError
 from .files import atomic
+from .stops import Stop
 
 CAPTURED, INFILL = 0, 1  # the values of ``kind``
 
@@ -21,7 +22,7 @@ class Strands:
     radius_mm: np.ndarray  # (N,) float32
     kind: np.ndarray  # (M,) uint8: CAPTURED or INFILL
     confidence: np.ndarray  # (N,) float32, 0 to 1
-    stops: np.ndarray | None = None  # (M, 2) uint8: why either end of a curve stopped growing (``grow.Stop``), 0 unknown
+    stops: np.ndarray | None = None  # (M, 2) uint8: why either end of a curve stopped growing (``stops.Stop``), 0 unknown
     provenance: dict = field(default_factory=dict)  # capture's name, parameters, version
 
     def __len__(self) -> int:
@@ -87,6 +88,7 @@ def statistics(strands: Strands) -> dict:
             "median": float(np.median(length)) if len(length) else 0.0,
             "longest": float(length.max(initial=0.0)),
         },
+        "ends": {stop.words: int(np.sum(captured.stops == stop)) for stop in Stop} if captured.stops is not None else {},
         "infill_curves": len(infill),
         "infill_length_mm": float(lengths(infill.points_mm, infill.offsets).sum()),
         "points": len(strands.points_mm),
@@ -106,6 +108,7 @@ def describe(numbers: dict) -> list[tuple[str, str]]:
         ("length of all", f"{length['total']:.0f} mm"),
         ("radius", f"{numbers['mean_radius_mm']:.4f} mm"),
         ("confidence", f"{numbers['mean_confidence']:.2f} of 1"),
+        ("ends of curves", ", ".join(f"{words}: {count}" for words, count in numbers["ends"].items() if count) or "unknown"),
         ("infill curves", f"{numbers['infill_curves']} ({numbers['infill_length_mm']:.0f} mm)"),
         ("points", f"{numbers['points']}"),
     ]
