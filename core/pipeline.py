@@ -22,7 +22,7 @@ from .errors import CaptureError, StrandscopeError
 from .features import SweepFeatures, build_index, load_features, pack, save_features, unpack
 from .files import atomic
 from .grow import PAPER, Grown, GrowParams, grow
-from .hull import HullParams, blueness, carve, grid_of, occupancy, visual_hull
+from .hull import Grid, HullParams, blueness, carve, grid_of, occupancy, visual_hull
 from .infill import InfillParams, infill
 from .progress import Progress, silent
 from .ridges import RidgeParams, Ridges, detect, estimate
@@ -31,6 +31,7 @@ from .strands import CAPTURED, INFILL, Strands, concatenate, save_strands
 VERSION = "0.1.0"
 WORKING_ROOM = 600_000_000  # bytes: the program itself, seed cells, a batch of curves
 SAMPLED_PHOTOGRAPHS = 24  # that ``estimate`` looks at
+STAMP = "made-from.txt"  # in the work folder
 # Table 1: c in 12-bit numbers with the black level (128) in it, omega in degrees, gamma in px, boxes in px
 _TABLE_1 = {"straight": (-140, 1.5, 0.5, (40.0, 30.0, 8.0)), "wavy": (-90, 1.5, 0.5, (60.0, 30.0, 8.0)), "curls": (-70, 1.5, 0.5, (60.0, 30.0, 8.0))}
 
@@ -68,8 +69,8 @@ def reconstruct(
     cannot be read, StrandscopeError where nothing was found or written, or more than ``memory_bytes`` would be needed.
     """
     capture = load_capture(capture_path)
-    parameters = _resolve(capture, parameters)
-    work = _work_folder(capture, Path(out), parameters)
+    parameters = resolve(capture, parameters)
+    work = work_folder(capture, Path(out), parameters)
     sweeps = find_features(capture, work, parameters, workers, progress)
     _check_memory(sweeps, memory_bytes)
     grown = grow(build_index(sweeps, capture.optics), parameters.grow, workers, progress)
@@ -160,7 +161,7 @@ def _blueness_path(work: Path, i: int) -> Path:
     return work / f"sweep_{i:03d}.blueness.npy"
 
 
-def _resolve(capture: Capture, parameters: Parameters) -> Parameters:
+def resolve(capture: Capture, parameters: Parameters) -> Parameters:
     """Fill in what the parameters leave to be estimated from the photographs."""
     if parameters.ridges.offset is not None:
         return parameters
@@ -169,8 +170,30 @@ def _resolve(capture: Capture, parameters: Parameters) -> Parameters:
     return replace(parameters, ridges=estimate([capture.planes(file)[0] for _, file in chosen], parameters.ridges))
 
 
-def _work_folder(capture: Capture, out: Path, parameters: Parameters) -> Path:
+def work_folder(capture: Capture, out: Path, parameters: Parameters) -> Path:
     """The folder beside ``out`` for this capture and these parameters of the filter; emptied when they were others."""
+    digest, work = _made_from(capture, parameters), _work_path(out)
+    stamp = work / STAMP
+    if not stamp.is_file() or stamp.read_text() != digest:
+        for old in work.glob("sweep_*"):
+            old.unlink()
+        with atomic(stamp) as part:
+            part.write_text(digest)
+    return work
+
+
+def has_work_folder(capture: Capture, out: Path, parameters: Parameters) -> bool:
+    """Whether a run of this capture with these parameters of the filter left its folder beside ``out``."""
+    stamp = _work_path(out) / STAMP
+    return stamp.is_file() and stamp.read_text() == _made_from(capture, parameters)
+
+
+def _work_path(out: Path) -> Path:
+    return out.with_name(out.stem + ".work")
+
+
+def _made_from(capture: Capture, parameters: Parameters) -> str:
+    """A digest of all that features depend on."""
     stats = [(f, os.stat(capture.folder / f)) for s in capture.sweeps for f in s.files]
     told = {
         "version": VERSION,
@@ -180,15 +203,7 @@ def _work_folder(capture: Capture, out: Path, parameters: Parameters) -> Path:
         "ridges": asdict(parameters.ridges),
         "hull": [parameters.hull.block_px, parameters.hull.dark],
     }
-    digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
-    work = out.with_name(out.stem + ".work")
-    stamp = work / "made-from.txt"
-    if not stamp.is_file() or stamp.read_text() != digest:
-        for old in work.glob("sweep_*"):
-            old.unlink()
-        with atomic(stamp) as part:
-            part.write_text(digest)
-    return work
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
 
 
 # ---- fibers -> strands -----------------------------------------------------------------------------------------------
@@ -211,12 +226,10 @@ def infill_strands(
     capture: Capture, work: Path, sweeps: list[SweepFeatures], strands: Strands, parameters: Parameters, workers: int, progress: Progress
 ) -> Strands:
     """Hair for the inside that no camera sees (sec. 4.3), along the captured ``strands``."""
-    optics, params = capture.optics, parameters.hull
+    grid, hull, rays = volumes(capture, work, sweeps, parameters.hull, workers, progress)
     with _threads(workers):
-        grid = grid_of(optics, capture.shape, capture.sweeps, params.voxel_mm)
-        hull = visual_hull(_counted(_blue_stacks(capture, work), len(sweeps), "visual hull", progress), optics, grid, params)
-        rays = carve(_counted(_rays(sweeps, capture), len(sweeps), "space carving", progress), optics, grid, params)
-        filled = infill(strands.points_mm, strands.offsets, strands.radius_mm, occupancy(hull, rays, grid, params), grid, parameters.infill, progress)
+        inside = occupancy(hull, rays, grid, parameters.hull)
+        filled = infill(strands.points_mm, strands.offsets, strands.radius_mm, inside, grid, parameters.infill, progress)
     count = len(filled.offsets) - 1
     return Strands(
         points_mm=filled.points_mm,
@@ -226,6 +239,18 @@ def infill_strands(
         confidence=np.zeros(len(filled.points_mm), np.float32),
         stops=np.zeros((count, 2), np.uint8),
     )
+
+
+def volumes(
+    capture: Capture, work: Path, sweeps: list[SweepFeatures], params: HullParams, workers: int, progress: Progress
+) -> tuple[Grid, np.ndarray, np.ndarray]:
+    """The grid of the captured volume, the highest blueness and the number of rays at each of its voxels (Fig. 9)."""
+    optics = capture.optics
+    grid = grid_of(optics, capture.shape, capture.sweeps, params.voxel_mm)
+    with _threads(workers):
+        hull = visual_hull(_counted(_blue_stacks(capture, work), len(sweeps), "visual hull", progress), optics, grid, params)
+        rays = carve(_counted(_rays(sweeps, capture), len(sweeps), "space carving", progress), optics, grid, params)
+    return grid, hull, rays
 
 
 def _blue_stacks(capture: Capture, work: Path) -> Iterator:
