@@ -407,6 +407,44 @@ def overlay(session, capture, strands, output, sweep, angle, position, color):
     session.report.done(output)
 
 
+@main_group.command(short_help="Draw what a capture shows, and where the curves are in it.")
+@click.argument("capture", type=PATH)
+@click.argument("out", type=PATH)
+@click.option("--strands", type=PATH, metavar="STRANDS.npz", help="The curves to show.  [default: OUT/strands.npz, made if need be]")
+@click.option("--height", type=float, metavar="MM", help="Look at this height.  [default: the middle of the photographs]")
+@click.option("--at", type=Numbers(), metavar="X,Y,Z", help="Or at this place, in mm.")
+@click.option("--fiber", type=click.IntRange(0), metavar="N", help="Or at the middle of this curve; the first is 0.")
+@click.option("--sweep", type=click.IntRange(0), metavar="K", help="Show photographs of this sweep.  [default: the one that sees the place best]")
+@click.option("--only", metavar="2b,2c,…", help="Draw these only: 2b, 2c, 3, 5, 6, 9, 10, 14, recall.")
+@click.option("--zoom", type=POSITIVE, default=3.0, show_default=True, metavar="MM", help="Width of close-ups.")
+@click.option("--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given.")
+@click.option("--memory", type=Memory(), default="6GB", show_default=True, help="Memory to use at most; a capture that needs more is refused.")
+@common
+@click.pass_obj
+def figures(session, capture, out, strands, height, at, fiber, sweep, only, zoom, workers, memory):
+    """Draw into the folder OUT what the photographs of CAPTURE show, and where the curves are in it.
+
+    The figures are those of the paper: a row of a sweep (2b), the star of a slice (2c), ribbons (3, 6), filters (5), hull and
+    carving (9), the hair (10), curves on a photograph (14). OUT/index.html shows them all and says what is seen. They look at
+    one place: ridges that were missed, depth, neighbours taken for one hair can be told there.
+
+    \b
+    Example:
+      strandscope figures lock out/figures --strands out/strands.npz --height 1.5
+    """
+    if sum(place is not None for place in (height, at, fiber)) > 1:
+        raise click.UsageError("--height, --at and --fiber exclude each other")
+    if at is not None and len(at) != 3:
+        raise click.UsageError(f"--at has {len(at)} numbers; expected three, X,Y,Z")
+    from .figures import FigureParams
+    from .figures import figures as draw
+
+    params = FigureParams(at_mm=at, height_mm=height, fiber=fiber, sweep=sweep, zoom_mm=zoom)
+    chosen = [name.strip() for name in only.split(",")] if only else []
+    page = draw(capture, out, strands, params, only=chosen, workers=workers, memory_bytes=memory, progress=session.report)
+    session.report.done(page)
+
+
 @main_group.command(short_help="Count and measure the hairs of a strands file.")
 @click.argument("strands", type=PATH)
 @click.option("--json", "json_file", type=PATH, help="Write the numbers to this file too.")

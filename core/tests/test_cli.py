@@ -13,7 +13,7 @@ from strandscope.core import cli
 from strandscope.core.cli import common, main_group, run
 from strandscope.core.errors import StrandscopeError
 
-VERBS = ["simulate", "import", "reconstruct", "overlay", "stats", "score"]
+VERBS = ["simulate", "import", "reconstruct", "overlay", "figures", "stats", "score"]
 
 
 def group_of(work):
@@ -59,7 +59,7 @@ def test_help_and_version_load_nothing_heavy():
     code = "import sys; from strandscope.core.cli import run; run(['--help']); run(['--version']); print(sorted(sys.modules))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = result.stdout.splitlines()[-1]
-    assert not any(f"'{heavy}'" in loaded for heavy in ("numpy", "scipy", "numba", "skimage", "rich", "bpy"))
+    assert not any(f"'{heavy}'" in loaded for heavy in ("numpy", "scipy", "numba", "skimage", "matplotlib", "rich", "bpy"))
     assert "0.1." in result.stdout
 
 
@@ -79,6 +79,8 @@ def test_without_a_verb_the_help_is_shown(capsys):
         (["reconstruct", "lock", "-o", "x.npz", "--preset", "bald"], "'bald'"),
         (["reconstruct", "lock", "-o", "x.npz", "--infill", "9", "--no-infill"], "exclude each other"),
         (["overlay", "lock", "x.npz", "-o", "x.png", "--sweep", "1", "--angle", "15"], "exclude each other"),
+        (["figures", "lock", "out", "--fiber", "3", "--height", "1"], "exclude each other"),
+        (["figures", "lock", "out", "--at", "1,2"], "expected three"),
         (["import", "p", "-o", "x", "--angles", "0:340:15"], "no whole number of steps"),
         (["import", "p", "-o", "x", "--angles", "a,b"], "no list of numbers"),
         (["import", "p", "-o", "x", "--positions", "1:2:0"], "no list of numbers"),
