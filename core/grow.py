@@ -44,7 +44,10 @@ _turn, _turn_back, _slope, _to_pixel, _to_image, _project = (
     njit(turn), njit(turn_back), njit(slope), njit(to_pixel), njit(to_image), njit(project),
 )  # fmt: skip
 BATCH = 64  # seeds grown against the same observations; part of the result, not of the machine
-MAX_HITS = 2048  # features of one camera that one step looks at
+MAX_HITS = 1024  # features that one step looks at, for each camera
+PLACE_PX, ANGLE_RAD = 0.22, 0.0436  # errors of one observation across the hair and of its angle (2.5 degrees)
+TWIST_RAD = 0.0436  # a camera that sees the hair turned by more than this (2.5 degrees) is no evidence for it
+OBSERVED_TOGETHER = 17.0  # observations of one camera in a step that err alike: rows and frames that see the same
 
 
 @dataclass(frozen=True)
@@ -52,32 +55,32 @@ class GrowParams:
     """Section 4.2 and Table 1; pixels are those of the channel plane."""
 
     step_mm: float = 0.1  # h
-    cone_deg: float = 1.5  # omega: largest turn in one step
+    cone_deg: float = 1.5  # omega: largest turn in one step, beyond the one that the curvature foretells
     max_correction_px: float = 0.5  # gamma: largest correction in one step
     box_px: tuple[float, float, float] = (40.0, 30.0, 8.0)  # a_g, a_s, a_t: full extents along the hair, the slope, across
-    near_focus_mm: float = 0.3  # a_s of find_orientations: full extent
     min_cameras: int = 3  # m: cameras that a step needs
-    bridge_mm: float = 1.0  # how far a hair is continued straight where it is not observed
+    bridge_mm: float = 1.0  # how far a hair is continued where it is not observed
     min_own: float = 0.45  # share of the observations of a curve that no curve before has used up
-    min_evidence: float = 1.0  # evidence that a step needs
-    pass_evidence: tuple[float, ...] = (5.0, 2.5, 1.25)  # evidence of a seed in each pass; a curve needs half of it on average
+    min_evidence: float = 2.0  # evidence that a step needs
+    seed_evidence: tuple[float, float, float] = (2.2, 1.5, 1.2)  # of a seed in each pass, in parts of what a step needs
+    mean_share: float = 0.6  # of it that a curve needs on average
     min_seed_cameras: int = 4  # angles that a seed cell must have recorded
     seed_cell_mm: float = 0.2
     min_length_mm: float = 2.0  # shorter curves are taken for chance
     max_length_mm: float = 400.0
-    weighted: bool = True  # False: every observation in the box counts the same, as in the paper
     sigma_px: float = 0.5  # weight across the ribbon
-    agree_px: float = 0.8  # a camera whose ribbon passes farther from where the others meet is not heard
+    agree_px: float = 0.7  # a camera whose ribbon passes farther from where the others meet is not heard
     claim_px: float = 0.6  # observations this near to a curve are used up by it
-    shared_weight: float = 0.2  # of an observation that another curve has used up: hairs cross in every photograph
-    sigma_deg: float = 4.0  # weight by angle; 2.2 of it is the gate
+    shared_weight: float = 0.02  # of an observation that another curve has used up: hairs cross in every photograph
+    sigma_deg: float = 3.0  # weight by angle; 2.2 of it is the gate
     sigma_focus_mm: float = 0.3  # weight by distance from the plane of focus
-    min_support: float = 0.1  # a camera speaks when it has this share of the observations of a hair in full view
+    min_support: float = 0.06  # a camera speaks when it has this share of the observations of a hair in full view
+    memory_mm: float = 0.5  # the way grown that foretells the next step fades over this length
+    foretold: tuple[float, float, float] = (0.02, 2.0, 0.2)  # trust in what is foretold: place (mm), direction (deg), curvature (1/mm)
     radius_mm: float = 0.04
 
 
-# The paper's own way, its unstated bounds as near as its words allow.
-PAPER = GrowParams(weighted=False, near_focus_mm=0.1, bridge_mm=0.5, min_length_mm=5.0)
+PAPER = GrowParams()
 
 
 @dataclass(frozen=True)
@@ -99,11 +102,9 @@ class _Box(NamedTuple):
     cone_sin: float
     gamma: float
     half: tuple[float, float, float]
-    near_focus: float
     min_cameras: int
     bridge: int
     max_points: int
-    weighted: bool
     sigma: float
     agree: float
     claim: float
@@ -114,6 +115,8 @@ class _Box(NamedTuple):
     full_support: float
     min_evidence: float
     min_seed_cameras: int
+    fade: float  # of what a point foretells, a step
+    prior: tuple[float, float, float]  # weight of what is foretold, in observations: of place, direction (mm²), curvature (mm⁴)
 
 
 def _box(params: GrowParams, index: Index) -> _Box:
@@ -127,21 +130,24 @@ def _box(params: GrowParams, index: Index) -> _Box:
         cone_sin=float(np.sin(cone)),
         gamma=params.max_correction_px * pitch_mm,
         half=tuple(0.5 * px * pitch_mm for px in params.box_px),
-        near_focus=0.5 * params.near_focus_mm,
         min_cameras=params.min_cameras,
         bridge=round(params.bridge_mm / params.step_mm),
         max_points=int(0.5 * params.max_length_mm / params.step_mm),
-        weighted=params.weighted,
         sigma=params.sigma_px * pitch_mm,
         agree=params.agree_px * pitch_mm,
         claim=params.claim_px * pitch_mm,
-        shared=params.shared_weight if params.weighted else 0.0,
+        shared=params.shared_weight,
         sigma_angle=float(np.radians(params.sigma_deg)),
         sigma_focus=params.sigma_focus_mm,
-        min_support=params.min_support * full_support if params.weighted else 1.0,
-        full_support=full_support if params.weighted else 1.0,
-        min_evidence=params.min_evidence if params.weighted else 0.0,
+        min_support=params.min_support * full_support,
+        full_support=full_support,
+        min_evidence=params.min_evidence,
         min_seed_cameras=params.min_seed_cameras,
+        fade=float(np.exp(-params.step_mm / params.memory_mm)),
+        prior=tuple(
+            OBSERVED_TOGETHER * (PLACE_PX * pitch_mm / sigma) ** 2
+            for sigma in (params.foretold[0], np.radians(params.foretold[1]), params.foretold[2])
+        ),
     )
 
 
@@ -176,9 +182,11 @@ def _hair_frame(index, k, p, g):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _gather(index, k, frame, angle, box, hits):
-    """Observations of camera k in the box of a hair; hits (n, 5) receives along, slope, across (mm), turn (rad) and weight.
+def _gather(index, k, frame, angle, bend, box, hits, count):
+    """Observations of camera k in the box of a hair; hits (n, 5) receives along, across (mm), turn (rad) and weight, from
+    row ``count`` on; returns the rows there are now.
 
+    bend: curvature of the hair towards t (1/mm). What the hair itself bends away is taken from across and turn.
     Bound by cache misses: a few dozen runs of 8-byte features.
     """
     half = box.half
@@ -186,7 +194,6 @@ def _gather(index, k, frame, angle, box, hits):
     first_frame, last_frame = frames_between(index, k, frame[0, 2] - reach[2], frame[0, 2] + reach[2])
     s0, s1, b0, b1 = cell_range(index, frame[0, 0], frame[0, 1], reach[0], reach[1])
     gate = 2.2 * box.sigma_angle
-    count = 0
     for strip in range(s0, s1):
         for block in range(b0, b1):
             start, stop = run_of(index, k, strip, block, first_frame, last_frame)
@@ -194,106 +201,176 @@ def _gather(index, k, frame, angle, box, hits):
                 u, v = image_of(index, i, strip, block)
                 x, y = u - frame[0, 0], v - frame[0, 1]
                 z = index.positions[index.first_position[k] + index.frame[i]] - frame[0, 2]
-                across = frame[3, 0] * x + frame[3, 1] * y + frame[3, 2] * z
-                used = index.strength[i] >= USED
-                if abs(across) > half[2] or (used and box.shared == 0):
-                    continue
                 along = frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z
-                depth = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z
-                if abs(along) > half[0] or abs(depth) > half[1]:
+                across = frame[3, 0] * x + frame[3, 1] * y + frame[3, 2] * z - 0.5 * bend * along * along
+                if abs(across) > half[2] or abs(along) > half[0]:
                     continue
-                off = index.angle[i] * (np.pi / ANGLE_STEPS) - angle
+                depth = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z
+                if abs(depth) > half[1]:
+                    continue
+                # s looks at the camera and t = g x s, so a hair that turns counterclockwise in the image leans away from t
+                off = index.angle[i] * (np.pi / ANGLE_STEPS) - angle + bend * along
                 off -= np.pi * np.round(off / np.pi)
-                if box.weighted and abs(off) > gate:
+                if abs(off) > gate:
                     continue
                 if count == len(hits):
                     return count
-                hits[count] = along, depth, across, off, box.shared if used else 1.0
+                # biweights of the width of Gaussians of these sigmas: no exp, and nothing from far away
+                y, z = off / box.sigma_angle, depth / box.sigma_focus
+                y, z = max(1 - 0.207 * y * y, 0.0), max(1 - 0.207 * z * z, 0.0)
+                hits[count] = along, across, off, y * y * z * z * (box.shared if index.strength[i] >= USED else 1.0)
                 count += 1
     return count
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _speak(hits, count, box, centre):
-    """What a camera says of a hair, from its observations: (support, offset across in mm, turn in the image in rad).
-
-    centre: where across the ribbon the hair is expected. The paper's mean, or a weighted mean with a line fitted along the
-    hair; the turn joins the angles of the features and the slope of that line by how well each is known.
-    """
-    w = wa = waa = we = wae = wo = near = 0.0
-    for i in range(count):
-        along, depth, across, off = hits[i, 0], hits[i, 1], hits[i, 2], hits[i, 3]
-        weight = 1.0
-        if box.weighted:  # biweights of the width of Gaussians of these sigmas: no exp, and nothing from far away
-            x, y, z = (across - centre) / box.sigma, off / box.sigma_angle, depth / box.sigma_focus
-            x, y, z = max(1 - 0.207 * x * x, 0.0), max(1 - 0.207 * y * y, 0.0), max(1 - 0.207 * z * z, 0.0)
-            weight = x * x * y * y * z * z * hits[i, 4]
-        w += weight
-        we += weight * across
-        if box.weighted or abs(depth) <= box.near_focus:
-            near += weight
-            wo += weight * off
-        wa += weight * along
-        waa += weight * along * along
-        wae += weight * along * across
-    if w < 1e-9:
-        return 0.0, 0.0, 0.0, False
-    offset = we / w
-    if not box.weighted:
-        return w, offset, wo / near if near else 0.0, near > 0
-    spread = waa - wa * wa / w
-    lean = (wae - wa * we / w) / spread if spread > 1e-12 else 0.0
-    # per observation: 0.22 px across, 2.5 degrees of angle
-    known_angle, known_lean = w / 0.0436**2, spread / (0.22 / 0.5 * 0.5 * box.sigma) ** 2
-    turned = wo / w
-    # s looks at the camera and t = g x s, so a hair that turns counterclockwise in the image leans away from t
-    joined = (known_angle * turned - known_lean * np.arctan(lean)) / (known_angle + known_lean)
-    return w, offset - lean * wa / w, joined, True
-
-
 class _View(NamedTuple):
-    """What the cameras say of a point: arrays over the sweeps, and how many spoke."""
+    """What the cameras say of a point: arrays over the sweeps."""
 
-    weight: np.ndarray  # (S,)
-    offset: np.ndarray  # (S,) across the ribbon, mm
+    hits: np.ndarray  # (n, 4) observations: along, across (mm), turn (rad), weight
+    ends: np.ndarray  # (S + 1,) int64: where each camera's observations begin
     across: np.ndarray  # (S, 3) t of each ribbon, object frame
-    normal: np.ndarray  # (S, 3) n of the plane of camera and hair, object frame
-    turned: np.ndarray  # (S,) bool: whether the camera gave an orientation
+    support: np.ndarray  # (S,) weight of the observations that agree
+
+
+@njit(cache=True, nogil=True)
+def _new_view(cameras):
+    return _View(np.empty((cameras * MAX_HITS, 4)), np.zeros(cameras + 1, np.int64), np.zeros((cameras, 3)), np.zeros(cameras))
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _look(index, p, g, box, hits, view):
-    """Ask every camera about a hair at p along g; fills view. Returns (cameras that spoke, cameras that could)."""
-    spoke = could = 0
+def _look(index, p, g, bend, box, view):
+    """Gather every camera's observations of a hair at p along g that bends by the curvature vector ``bend`` (3,) 1/mm.
+    Returns how many cameras could see it."""
+    could = count = 0
     for k in range(len(index.cos)):
-        view.weight[k] = 0.0
-        view.turned[k] = False
+        view.ends[k] = count
         frame, angle, size = _hair_frame(index, k, p, g)
         if not _sees(index, k, frame[0, 0], frame[0, 1], frame[0, 2]):
             continue
         could += 1
         if size < 0.2:  # the hair points at the camera
             continue
-        count = _gather(index, k, frame, angle, box, hits)
-        if count == 0:
-            continue
-        support, offset, turn_by, turned = _speak(hits, count, box, 0.0)
-        if box.weighted and support > 0:
-            support, offset, turn_by, turned = _speak(hits, count, box, offset)
-        if support < box.min_support:
-            continue
-        spoke += 1
-        view.weight[k] = support
-        view.offset[k] = offset
-        view.across[k] = _turn_back(frame[3, 0], frame[3, 1], frame[3, 2], index.cos[k], index.sin[k])
-        # n: the plane through the camera and the line of this orientation in the image
-        sx, sy, sz = _slope(frame[0, 0], frame[0, 1], index.distance)
-        ou, ov = np.cos(angle + turn_by), np.sin(angle + turn_by)
-        nx, ny, nz = ov * sz, -ou * sz, ou * sy - ov * sx
-        norm = np.sqrt(nx * nx + ny * ny + nz * nz)
-        view.normal[k] = _turn_back(nx / norm, ny / norm, nz / norm, index.cos[k], index.sin[k])
-        view.turned[k] = turned
-    return spoke, could
+        tx, ty, tz = _turn_back(frame[3, 0], frame[3, 1], frame[3, 2], index.cos[k], index.sin[k])
+        view.across[k] = tx, ty, tz
+        count = _gather(index, k, frame, angle, bend[0] * tx + bend[1] * ty + bend[2] * tz, box, view.hits, count)
+    view.ends[len(index.cos)] = count
+    return could
+
+
+# ---- the hair that fits ----------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _fit(view, g, box, wide, prior):
+    """The bent line that the observations of ``view`` support: (cameras that agree, evidence, place, direction, curvature).
+
+    The last three are vectors (3,) perpendicular to g by which the hair differs from the one looked for: at the way ``a``
+    along g it lies at place + direction a + curvature a^2 / 2. Weighted least squares over the offsets and the angles of all
+    observations at once (eq. 3 made longer), three times: each observation counts less the farther it lies from the hair of
+    the time before, and so does a camera as a whole. ``wide`` is the width of that weight in sigma; ``prior`` holds place,
+    direction and curvature to what was looked for.
+    """
+    cameras = len(view.support)
+    ax, ay = _perpendicular(g)
+    theta = np.zeros(6)
+    m, b = np.empty((6, 6)), np.empty(6)
+    lever = (PLACE_PX / 0.5 * box.sigma / ANGLE_RAD) ** 2
+    spoke = 0
+    evidence = 0.0
+    for trial in range(4):
+        m[:] = 0.0
+        b[:] = 0.0
+        for c in range(6):
+            m[c, c] = prior[c // 2]
+            b[c] = 0.0
+        spoke, evidence = 0, 0.0
+        narrow = 1 / (wide * box.sigma)
+        for k in range(cameras):
+            view.support[k] = 0.0
+            if view.ends[k + 1] == view.ends[k]:
+                continue
+            t = view.across[k]
+            tx, ty = t[0] * ax[0] + t[1] * ax[1] + t[2] * ax[2], t[0] * ay[0] + t[1] * ay[1] + t[2] * ay[2]
+            o0, o1, o2 = theta[0] * tx + theta[1] * ty, theta[2] * tx + theta[3] * ty, theta[4] * tx + theta[5] * ty
+            s0 = s1 = s2 = s3 = s4 = r0 = r1 = r2 = l0 = l1 = rest = 0.0
+            for i in range(view.ends[k], view.ends[k + 1]):
+                a, across, off, w = view.hits[i]
+                left = across - (o0 + a * (o1 + 0.5 * a * o2))
+                x = left * narrow
+                x = 1 - 0.207 * x * x
+                if x <= 0:
+                    continue
+                w *= x * x
+                wa, waa = w * a, w * a * a
+                s0 += w
+                s1 += wa
+                s2 += waa
+                s3 += waa * a
+                s4 += waa * a * a
+                rest += w * left
+                r0 += w * across
+                r1 += wa * across
+                r2 += waa * across
+                l0 -= w * off
+                l1 -= wa * off
+            if s0 < box.min_support:
+                continue
+            far = rest / s0 / (wide * box.agree)
+            agree = max(1 - far * far, 0.0) ** 2
+            if agree == 0:
+                continue
+            twist = (o1 + (o2 * s1 - l0) / s0) / TWIST_RAD
+            spoke += 1
+            view.support[k] = s0 * agree
+            evidence += np.cbrt(min(s0 / box.full_support, 1.0)) * agree * max(1 - twist * twist, 0.0) ** 2
+            # rows of the normal matrix: place, direction, curvature along t
+            block = (s0, s1, 0.5 * s2, s2 + lever * s0, 0.5 * s3 + lever * s1, 0.25 * s4 + lever * s2)
+            right = (r0, r1 + lever * l0, 0.5 * r2 + lever * l1)
+            for c in range(3):
+                for d in range(3):
+                    e = block[d if c == 0 else (c if d == 0 else c + d + 1)]
+                    m[2 * c, 2 * d] += agree * e * tx * tx
+                    m[2 * c, 2 * d + 1] += agree * e * tx * ty
+                    m[2 * c + 1, 2 * d] += agree * e * ty * tx
+                    m[2 * c + 1, 2 * d + 1] += agree * e * ty * ty
+                b[2 * c] += agree * right[c] * tx
+                b[2 * c + 1] += agree * right[c] * ty
+        if spoke == 0 or trial == 3:
+            break
+        _cholesky_solve(m, b, theta)
+    return spoke, evidence, theta[0] * ax + theta[1] * ay, theta[2] * ax + theta[3] * ay, theta[4] * ax + theta[5] * ay
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _perpendicular(g):
+    """Two unit vectors (3,) that make a right-handed frame with the unit vector g."""
+    x = np.zeros(3)
+    x[np.argmin(np.abs(g))] = 1.0
+    x -= g * (g[0] * x[0] + g[1] * x[1] + g[2] * x[2])
+    x /= np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+    return x, np.cross(g, x)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _cholesky_solve(m, b, x):
+    """Solve m x = b for a symmetric positive definite m (n, n), which is overwritten."""
+    n = len(b)
+    for i in range(n):
+        for j in range(i + 1):
+            s = m[i, j]
+            for k in range(j):
+                s -= m[i, k] * m[j, k]
+            m[i, j] = np.sqrt(max(s, 1e-12)) if i == j else s / m[j, j]
+    for i in range(n):
+        s = b[i]
+        for k in range(i):
+            s -= m[i, k] * x[k]
+        x[i] = s / m[i, i]
+    for i in range(n - 1, -1, -1):
+        s = x[i]
+        for k in range(i + 1, n):
+            s -= m[k, i] * x[k]
+        x[i] = s / m[i, i]
 
 
 # ---- Figure 7 --------------------------------------------------------------------------------------------------------
@@ -324,31 +401,6 @@ def solve_direction(normals, weights, g):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def solve_correction(across, offsets, weights, g):
-    """The offset (3,) perpendicular to g that brings the point to where the ribbons meet (eq. 3), in the least squares:
-    across (S, 3) . offset = offsets (S,). Each camera's sum over its observations enters as their mean with their number."""
-    xx = np.zeros((3, 3))
-    b = np.zeros(3)
-    total = 0.0
-    for k in range(len(weights)):
-        if weights[k] > 0:
-            t = across[k]
-            total += weights[k]
-            for i in range(3):
-                b[i] += weights[k] * t[i] * offsets[k]
-                for j in range(3):
-                    xx[i, j] += weights[k] * t[i] * t[j]
-    for i in range(3):  # g itself is not to be moved along; the ridge holds what no camera tells
-        for j in range(3):
-            xx[i, j] += total * g[i] * g[j]
-        xx[i, i] += 1e-3 * total
-    c0, c1, c2 = np.cross(xx[1], xx[2]), np.cross(xx[2], xx[0]), np.cross(xx[0], xx[1])
-    det = xx[0, 0] * c0[0] + xx[0, 1] * c0[1] + xx[0, 2] * c0[2]
-    q = (c0 * b[0] + c1 * b[1] + c2 * b[2]) / det
-    return q - g * (q[0] * g[0] + q[1] * g[1] + q[2] * g[2])
-
-
-@njit(cache=True, nogil=True, fastmath=True)
 def _within_cone(new, old, box):
     """``new`` turned back to the rim of the cone of omega around ``old`` where it lies outside (unit vectors)."""
     c = new[0] * old[0] + new[1] * old[1] + new[2] * old[2]
@@ -362,126 +414,113 @@ def _within_cone(new, old, box):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _corrected(p, g, view, bound):
-    """p drawn to where the ribbons meet, by no more than bound (mm)."""
-    q = solve_correction(view.across, view.offset, view.weight, g)
+def _bounded(q, bound):
+    """q (3,), no longer than bound."""
     size = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2)
-    if size > bound:
-        q *= bound / size
-    return p + q
+    return q * (bound / size) if size > bound else q
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _listen(view, g, box):
-    """Weigh down the cameras whose ribbon passes the others' meeting point by: their number that agree. Starts at the
-    prediction, so that a crowd on a neighbouring hair does not win. ``view.weight`` is 0 for those that do not agree."""
-    agreeing = 0
-    q = np.zeros(3)
-    weights = np.empty_like(view.weight)
-    bound = box.agree * box.agree
-    for trial in range(3):
-        agreeing = 0
-        for k in range(len(weights)):
-            t = view.across[k]
-            off = view.offset[k] - (t[0] * q[0] + t[1] * q[1] + t[2] * q[2])
-            near = max(1 - off * off / bound, 0.0)
-            weights[k] = view.weight[k] * near * near
-            agreeing += weights[k] > 0
-        if trial < 2 and agreeing:
-            q = solve_correction(view.across, view.offset, weights, g)
-    view.weight[:] = weights
-    return agreeing
-
-
-@njit(cache=True, nogil=True)
-def _new_view(cameras):
-    return _View(np.zeros(cameras), np.zeros(cameras), np.zeros((cameras, 3)), np.zeros((cameras, 3)), np.zeros(cameras, np.bool_))
+def _unit(g):
+    return g / np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _observe(index, p, g, box, hits, view):
-    """Ask the cameras and leave out those that disagree. Returns (cameras that agree, evidence, cameras that could see)."""
-    spoke, could = _look(index, p, g, box, hits, view)
-    if box.weighted and spoke:
-        spoke = _listen(view, g, box)
-    evidence = 0.0
-    for k in range(len(view.weight)):
-        evidence += min(view.weight[k] / box.full_support, 1.0)
-        view.turned[k] = view.turned[k] and view.weight[k] > 0
-    return spoke, evidence, could
+def _foretell(state, evidence, filled, sign, box):
+    """Where the hair will be one step on: (p, g, curvature vector), each (3,).
+
+    From each of the last points the hair is carried on by its place, direction and curvature there; the mean of these,
+    the last ones counting most. state (n, 9): points, tangents (turned by ``sign``), curvatures.
+    """
+    p, g, bend = np.zeros(3), np.zeros(3), np.zeros(3)
+    total, fade = 0.0, 1.0
+    for j in range(filled - 1, max(filled - 21, -1), -1):
+        a, w = (filled - j) * box.step, fade * (evidence[j] + 1e-6)
+        fade *= box.fade
+        total += w
+        for c in range(3):
+            x, t, k = state[j, c], sign * state[j, 3 + c], state[j, 6 + c]
+            p[c] += w * (x + a * (t + 0.5 * a * k))
+            g[c] += w * (t + a * k)
+            bend[c] += w * k
+    g = _unit(g / total)
+    bend /= total
+    return p / total, g, bend - g * (g[0] * bend[0] + g[1] * bend[1] + g[2] * bend[2])
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _grow_end(index, p, g, box, hits, view, points, evidence):
-    """Grow from p along g; fills points (n, 3) and evidence (n,). Returns (points kept, Stop). The seed itself is not written."""
-    count = kept = unseen = 0
-    while count < min(box.max_points, len(points)):
-        p = p + box.step * g
-        spoke, seen, could = _observe(index, p, g, box, hits, view)
+def _grow_end(index, box, view, state, evidence, filled, sign):
+    """Grow on from state (n, 9), of which the first ``filled`` rows are there: points, tangents (turned by ``sign``) and
+    curvatures; fills it and evidence (n,). Returns (points there are now, Stop)."""
+    kept, unseen = filled, 0
+    for count in range(filled, len(state)):
+        p, g, bend = _foretell(state, evidence, count, sign, box)
+        could = _look(index, p, g, bend, box, view)
         if could < box.min_cameras:
             return kept, Stop.LEFT_VOLUME.value
+        spoke, seen, place, way, curve = _fit(view, g, box, 1.0, box.prior)
         if spoke >= box.min_cameras and seen >= box.min_evidence:
-            p = _corrected(p, g, view, box.gamma)
-            if np.sum(view.turned) >= box.min_cameras:
-                g = _within_cone(solve_direction(view.normal, view.weight * view.turned, g), g, box)
+            p = p + _bounded(place, box.gamma)
+            g = _within_cone(_unit(g + way), g, box)
+            bend = bend + curve
             unseen = 0
         else:
             unseen += 1
+            seen = 0.0
             if unseen > box.bridge:
                 return kept, Stop.UNOBSERVED.value
-        points[count] = p
-        evidence[count] = seen
-        count += 1
+        state[count, :3], state[count, 3:6], state[count, 6:], evidence[count] = p, sign * g, bend, seen
         if unseen == 0:
-            kept = count
+            kept = count + 1
     return kept, Stop.TOO_LONG.value
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _snap(index, p, g, box, hits, view):
-    """Draw a seed onto the centreline: (evidence, p, g). It must come to rest with enough cameras; evidence is 0 if not."""
-    start = p.copy()
+def _snap(index, p, g, least, box, view):
+    """Draw a seed onto the centreline: (evidence, p, g, curvature). It must come to rest with enough cameras, else evidence
+    is less than ``least``."""
+    start, bend = p.copy(), np.zeros(3)
     moved = evidence = 0.0
+    loose = (0.01 * box.prior[0], 0.01 * box.prior[1], box.prior[2])
     for trial in range(5):
-        if trial < 2:  # from the middle of a cell the hair may be far: nobody is left out yet
-            spoke, _ = _look(index, p, g, box, hits, view)
-        else:
-            spoke, evidence, _ = _observe(index, p, g, box, hits, view)
-        if spoke < box.min_seed_cameras or np.sum(view.turned) < box.min_cameras:
-            return 0.0, p, g
-        before = p
-        p = _corrected(p, g, view, 2 * box.half[2])
-        g = solve_direction(view.normal, view.weight * view.turned, g)
-        moved = np.sqrt(np.sum((p - before) ** 2))
+        _look(index, p, g, bend, box, view)
+        # from the middle of a cell the hair may be far
+        spoke, evidence, place, way, curve = _fit(view, g, box, 4.0 if trial == 0 else (2.0 if trial == 1 else 1.0), loose)
+        if spoke < box.min_seed_cameras or evidence < least:
+            return min(evidence, 0.99 * least), p, g, bend
+        p = p + _bounded(place, 2 * box.half[2])
+        g = _unit(g + way)
+        if trial > 1:
+            bend = bend + curve
+        moved = np.sqrt(np.sum(place**2))
         if np.sqrt(np.sum((p - start) ** 2)) > 3 * box.half[2]:
-            return 0.0, p, g
-    return evidence if moved < 2 * box.gamma else 0.0, p, g
+            return 0.0, p, g, bend
+    return evidence if moved < 2 * box.gamma else 0.0, p, g, bend
 
 
 @njit(cache=True, nogil=True)
-def _grow_seeds(index, seeds, directions, least, box, points, evidence, begin, end, stops, strength):
-    """Grow every seed of enough evidence on the same observations. Curve b is points[b, begin[b]:end[b]], the seed in the
+def _grow_seeds(index, seeds, directions, least, box, state, evidence, begin, end, stops, strength):
+    """Grow every seed of enough evidence on the same observations. Curve b is state[b, begin[b]:end[b]], the seed in the
     middle of the row; strength[b] is the seed's evidence."""
-    middle = points.shape[1] // 2
-    hits = np.empty((MAX_HITS, 5))
+    middle = state.shape[1] // 2
     view = _new_view(len(index.cos))
     for b in range(len(seeds)):
         begin[b] = end[b] = middle
-        strength[b], p, g = _snap(index, seeds[b], directions[b], box, hits, view)
-        if strength[b] < least or strength[b] == 0:
+        strength[b], p, g, bend = _snap(index, seeds[b], directions[b], least, box, view)
+        if strength[b] < least:
             continue
-        points[b, middle], evidence[b, middle] = p, strength[b]
-        ahead, stop_ahead = _grow_end(index, p, g, box, hits, view, points[b, middle + 1 :], evidence[b, middle + 1 :])
-        back, stop_back = _grow_end(index, p, -g, box, hits, view, points[b, middle - 1 :: -1], evidence[b, middle - 1 :: -1])
-        begin[b], end[b] = middle - back, middle + 1 + ahead
-        stops[b, 0], stops[b, 1] = stop_back, stop_ahead
+        state[b, middle, :3], state[b, middle, 3:6], state[b, middle, 6:], evidence[b, middle] = p, g, bend, strength[b]
+        ahead, stops[b, 1] = _grow_end(index, box, view, state[b, middle:], evidence[b, middle:], 1, 1.0)
+        last = middle + ahead - 1
+        back, stops[b, 0] = _grow_end(index, box, view, state[b, last::-1], evidence[b, last::-1], ahead, -1.0)
+        begin[b], end[b] = last + 1 - back, last + 1
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _claim(index, points, box, take):
     """(observations of a curve (n, 3) still there, observations in all); with ``take`` they are used up (REMOVE-FEATURES)."""
     there = total = 0
-    reach_focus = 2.5 * box.sigma_focus if box.weighted else box.half[1]
+    reach_focus = 2.5 * box.sigma_focus
     for j in range(len(points)):
         tangent = points[min(j + 1, len(points) - 1)] - points[max(j - 1, 0)]
         tangent /= np.sqrt(np.sum(tangent**2)) + 1e-30
@@ -606,8 +645,8 @@ def _seed_grid(index: Index, params: GrowParams) -> _Grid:
     return _Grid(low, params.seed_cell_mm, shape)
 
 
-def _seeds(index: Index, params: GrowParams) -> np.ndarray:
-    """Centres (n, 3) mm of the cells that at least ``min_seed_cameras`` sweeps recorded, most angles first."""
+def _seeds(index: Index, params: GrowParams) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (n, 3) mm of the cells that at least ``min_seed_cameras`` sweeps recorded, most angles first, and how many (n,)."""
     grid = _seed_grid(index, params)
     masks = np.zeros(grid.shape, np.uint64)
     _raster(index, grid, masks)
@@ -617,7 +656,7 @@ def _seeds(index: Index, params: GrowParams) -> np.ndarray:
     shuffled = np.random.default_rng(0).permutation(len(cells))  # neighbours in a batch would grow the same fiber
     order = shuffled[np.argsort(-found[shuffled].astype(int), kind="stable")]
     where = np.stack(np.unravel_index(cells[order], grid.shape), -1)
-    return grid.low + (where + 0.5) * grid.cell
+    return grid.low + (where + 0.5) * grid.cell, counts.ravel()[cells[order]]
 
 
 # ---- the whole -------------------------------------------------------------------------------------------------------
@@ -629,20 +668,20 @@ def grow(index: Index, params: GrowParams, workers: int = 1, progress: Progress 
     Deterministic: the same index and parameters give the same curves in the same order, whatever the number of threads.
     """
     box = _box(params, index)
-    centres = _seeds(index, params)
-    bound = np.full(len(centres), np.inf)  # evidence of each seed when last looked at; it can only fall
+    centres, cameras = _seeds(index, params)
+    bound = cameras.astype(float)  # the most evidence that each seed can have: a camera's is 1, and it can only fall
     store = _BatchStore.of(BATCH, 2 * min(box.max_points, _longest(index, params)) + 1)
     curves: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    passes = params.pass_evidence if params.weighted else (0.0,)
     with ThreadPoolExecutor(workers) as pool:
-        for number, least in enumerate(passes):
+        for number, share in enumerate(params.seed_evidence):
+            least = share * params.min_evidence
             seeds = np.flatnonzero(bound >= least)
             for first in range(0, len(seeds), BATCH):
-                progress("growing", number + first / max(len(seeds), 1), len(passes))
+                progress("growing", number + first / max(len(seeds), 1), len(params.seed_evidence))
                 chosen = seeds[first : first + BATCH]
                 bound[chosen] = _grow_batch(pool, index, centres[chosen], least, params, box, store)
-                curves += _accept(index, store, len(chosen), 0.5 * least, params, box)
-    progress("growing", len(passes), len(passes))
+                curves += _accept(index, store, len(chosen), params.mean_share * least, params, box)
+    progress("growing", len(params.seed_evidence), len(params.seed_evidence))
     return _flat(curves, len(centres))
 
 
@@ -679,7 +718,7 @@ def _longest(index: Index, params: GrowParams) -> int:
 class _BatchStore:
     """Room for the curves of a batch, made once."""
 
-    points: np.ndarray
+    state: np.ndarray
     evidence: np.ndarray
     begin: np.ndarray
     end: np.ndarray
@@ -689,15 +728,15 @@ class _BatchStore:
     @classmethod
     def of(cls, seeds: int, points: int) -> "_BatchStore":
         counts = [np.zeros(seeds, np.int64) for _ in range(2)]
-        return cls(np.empty((seeds, points, 3)), np.empty((seeds, points), np.float32), *counts, np.zeros((seeds, 2), np.uint8), np.zeros(seeds))
+        return cls(np.empty((seeds, points, 9)), np.empty((seeds, points), np.float32), *counts, np.zeros((seeds, 2), np.uint8), np.zeros(seeds))
 
     def part(self, s: slice):
-        return self.points[s], self.evidence[s], self.begin[s], self.end[s], self.stops[s], self.strength[s]
+        return self.state[s], self.evidence[s], self.begin[s], self.end[s], self.stops[s], self.strength[s]
 
     def curve(self, b: int):
         """Copies of the points, the evidence and the stops of curve b."""
         row = slice(self.begin[b], self.end[b])
-        return self.points[b, row].copy(), self.evidence[b, row].copy(), self.stops[b].copy()
+        return self.state[b, row, :3].copy(), self.evidence[b, row].copy(), self.stops[b].copy()
 
 
 def _accept(index, store: _BatchStore, count: int, least: float, params: GrowParams, box: _Box):
