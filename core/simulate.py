@@ -364,12 +364,12 @@ def _draw(ends, point, turn, view, axis, span, nearest):
     chord, lens_v, per_pitch = point[1], point[2], one / pitch
     axis_col, axis_row = axis[0] - point[3], axis[1] - point[4]
     fine = np.float32(_FINEST) / (span[1] - span[0])
-    lens_u = np.empty(rows, np.float32)
+    lens_u = np.zeros(rows + 8, np.float32)
     for r in range(rows):
         part = point[0] + turn[r]
         lens_u[r] = chord * (two * (part - one if part >= one else part) - one)
-    first, places = np.empty((2, rows), np.int32)
-    begin, step, high = np.empty((3, rows), np.float32)
+    first, places = np.empty((2, rows + 8), np.int32)
+    begin, step, high = np.empty((3, rows + 8), np.float32)
     for k in range(len(ends)):
         w0, w1, radius = ends[k, 2], ends[k, 5], ends[k, 6]
         # Seen from (L_u, L_v) a point appears at L + project(point - L), which is project(point) + L (1 - scale).
@@ -387,14 +387,14 @@ def _draw(ends, point, turn, view, axis, span, nearest):
         dr, dc, dw, swing = r1 - r0, c1 - c0, w1 - w0, sway1 - sway0
         deep, low, tag = dw * per_pitch, (w0 - span[0]) * fine, k << 16
         if abs(dr) < max(abs(dc) + chord * abs(swing), half_of * abs(deep)):
-            _draw_level(tag, c0, r0, low, dc, dr, dw * fine, deep, sway0, swing, half, radius * fine, lens_u, nearest)
+            _draw_level(tag, c0, r0, low, dc, dr, dw * fine, deep, sway0, swing, half, radius * fine, chord, lens_u, nearest)
             continue
         # Upright: each row between the ends belongs to this segment alone, so that neighbours join without a gap.
         per_dr, per_half, dlow = one / dr, one / half, dw * fine
         bulge = radius * fine * math.sqrt(one + (deep * per_dr) ** 2)
         top = max(math.ceil(min(r0, r1)), 0)
         count = min(math.ceil(max(r0, r1)), rows) - top
-        for j in range(count):
+        for j in range(8 * ((count + 7) // 8)):  # whole vectors
             r = top + j
             t, lean = (np.float32(r) - r0) * per_dr, dc + lens_u[r] * swing
             centre = c0 + lens_u[r] * sway0 + t * lean
@@ -419,43 +419,32 @@ def _draw(ends, point, turn, view, axis, span, nearest):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw_level(tag, at0, r0, low, along, dr, dlow, deep, sway0, swing, half, radius, lens_u, nearest):
+def _draw_level(tag, at0, r0, low, along, dr, dlow, deep, sway0, swing, half, radius, chord, lens_u, nearest):
     """Draw a segment that lies level in the image or points at the camera: pixels nearer than ``half`` to its line.
 
     It is drawn on beyond its ends by half its width, over its neighbours, so that no gap opens between them.
     """
-    rows, columns = nearest.shape[0], nearest.shape[1] - 2 * _EDGE
-    zero, half_of, one = np.float32(0), np.float32(0.5), np.float32(1)
-    more, per_half = half + np.float32(0.1), one / half
-    for r in range(max(math.ceil(min(r0, r0 + dr) - half - more), 0), min(math.floor(max(r0, r0 + dr) + half + more), rows - 1) + 1):
+    zero, one, more, per_half = np.float32(0), np.float32(1), half + np.float32(0.1), np.float32(1) / half
+    tall = math.sqrt(half * half + more * more)  # a corner is this far from its end
+    wide = 8 * math.ceil((abs(along) + chord * abs(swing) + tall + tall + one) / np.float32(8))
+    for r in range(max(math.ceil(min(r0, r0 + dr) - tall), 0), min(math.floor(max(r0, r0 + dr) + tall) + 1, len(nearest))):
         c0, dc = at0 + lens_u[r] * sway0, along + lens_u[r] * swing
         length = math.sqrt(dc * dc + dr * dr) + np.float32(1e-4)
         per_length = one / length
         tc, tr, y = dc * per_length, dr * per_length, np.float32(r) - r0
         bulge = radius * min(math.sqrt(one + (deep * per_length) ** 2), np.float32(4))
-        # |across| < half and -more < along < length + more each leave an interval of columns.
-        left, right = min(c0, c0 + dc) - half - more, max(c0, c0 + dc) + half + more
-        if abs(tr) > np.float32(1e-4):
-            centre, wide = c0 + y * tc / tr, half / abs(tr)
-            left, right = max(left, centre - wide), min(right, centre + wide)
-        elif abs(y) > half:
-            continue
-        if abs(tc) > np.float32(1e-4):
-            centre, wide = c0 + (half_of * length - y * tr) / tc, (half_of * length + more) / abs(tc)
-            left, right = max(left, centre - wide), min(right, centre + wide)
-        elif y * tr < -more or y * tr > length + more:
-            continue
-        begin, end = max(math.ceil(left), 0), min(math.floor(right), columns - 1) + 1
+        left = math.floor(min(c0, c0 + dc) - tall) + _EDGE
+        begin, end = max(left, 0), min(left + wide, nearest.shape[1])
         if begin >= end:
             continue
-        pixels, x0 = nearest[r, _EDGE + begin : _EDGE + end], np.float32(begin) - c0
-        for i in range(end - begin):
+        pixels, x0 = nearest[r, begin:end], np.float32(begin - _EDGE) - c0
+        for i in range(len(pixels)):
             x = x0 + np.float32(np.int32(i))
-            t, across = min(max((x * tc + y * tr) * per_length, zero), one), (x * tr - y * tc) * per_half
-            q = min(across * across, np.float32(0.999))
-            near = np.int64(np.int32(low + t * dlow + bulge * math.sqrt(one - q)))
+            s, across = x * tc + y * tr, (x * tr - y * tc) * per_half
+            t, q = min(max(s * per_length, zero), one), across * across
+            near = np.int64(np.int32(low + t * dlow + bulge * math.sqrt(max(one - q, zero))))
             number = (near << 38) + (tag + np.int64((np.int32(t * np.float32(255)) << 8) + np.int32(q * np.float32(256))))
-            pixels[i] = max(pixels[i], number)
+            pixels[i] = max(pixels[i], number if (q < one) & (s > -more) & (s < length + more) else 0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
