@@ -664,7 +664,7 @@ def _photographs(capture: Capture, hair: Hair, params: SimulateParams, progress:
     background = board(optics, (scale.rows, scale.columns), look)
     fog = density(hair)
     gain = _gain(hair, fog, look, params)
-    reach = float(np.hypot(hair.points_mm[:, 0], hair.points_mm[:, 2]).max())
+    reach = float(np.percentile(np.hypot(hair.points_mm[:, 0], hair.points_mm[:, 2]), 99))  # few fibers fly off farther
     stopped = replace(optics, aperture_cone_deg=stopped_cone_deg(params))
     sequences = [(s.angle_deg, d, f, optics) for s in capture.sweeps for d, f in zip(s.positions_mm, s.files, strict=True)]
     sequences += [(a, capture.turntable.focus_mm, f, stopped) for a, f in zip(capture.turntable.angles_deg, capture.turntable.files, strict=True)]
