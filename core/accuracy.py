@@ -130,11 +130,11 @@ def _check(lock: Lock, capture: Capture) -> None:
     """Raise StrandscopeError where a capture has no truth, or was simulated with other parameters than its name says."""
     if capture.truth_path is None or not capture.truth_path.is_file():
         raise StrandscopeError(f"{capture.folder}: has no truth to score against; expected a simulated capture")
-    found = capture.unknown.get("simulation", {})
     if lock.params:
-        for name, value in asdict(lock.params).items():
-            if found.get(name) != value:
-                raise StrandscopeError(f"{capture.folder}: was simulated with {name} {found.get(name)}, not {value}; expected another folder")
+        found = asdict(SimulateParams()) | capture.unknown.get("simulation", {})  # a capture may be older than a parameter
+        for name, value in json.loads(json.dumps(asdict(lock.params))).items():
+            if found[name] != value:
+                raise StrandscopeError(f"{capture.folder}: was simulated with {name} {found[name]}, not {value}; expected another folder")
 
 
 def _check_room(folder: Path, listed: Sequence[Lock]) -> None:

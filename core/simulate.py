@@ -29,7 +29,7 @@ from .raw import write_dng
 
 BLACK, WHITE = 512, 15871  # of the sensor, 14 bit
 JOURNAL = "simulation.json"  # what was asked for, to know whether a run can be continued
-REVISION = 2  # raise it when the same parameters give other photographs
+REVISION = 3  # raise it when the same parameters give other photographs
 _SITES = ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2))  # of the RGGB cell: row, column, colour
 _PROFILE = 256  # brightnesses across a fiber that are told apart
 _EDGE = 32  # columns beside an image, so that a row of a fiber is drawn whole
@@ -103,7 +103,8 @@ class Lens:
 
     In row r, drawing i is seen from v = v_mm[i] and u = chord * (2 * frac(phase[i] + turn[r]) - 1), with chord the disc's half
     width at that v. The points of a row are a golden-ratio lattice on the disc, even in number and in every direction; the
-    next row has another turn of it, at random, so that a blurred fiber leaves no copies of itself that run along with it.
+    next row has another turn of it, so that a blurred fiber leaves no copies of itself that run along with it, and turns of
+    neighbouring rows fill each other's gaps, so that little is left of the grain over the length of a filter for ridges.
     """
 
     radius_mm: float
@@ -125,7 +126,8 @@ def lens(count: int, radius_mm: float, rows: int, rng) -> Lens:
     share = 0.5 + (v * np.sqrt(1 - v * v) + np.arcsin(v)) / np.pi  # of the disc below v
     v = np.interp((i + rng.random()) / count, share, v)
     shift = (np.stack([i / plastic, i / plastic**2], axis=-1) + rng.random(2)) % 1.0 - 0.5
-    return Lens(radius_mm, (i * golden + rng.random()) % 1.0, radius_mm * v, shift, rng.random(rows))
+    turn = (np.arange(rows) / plastic + rng.random()) % 1.0
+    return Lens(radius_mm, (i * golden + rng.random()) % 1.0, radius_mm * v, shift, turn)
 
 
 def aperture_radius_mm(optics: Optics) -> float:
@@ -136,12 +138,12 @@ def aperture_radius_mm(optics: Optics) -> float:
 def lens_count(optics: Optics, depth_mm: float) -> int:
     """How many points on the lens make a fiber ``depth_mm`` out of focus an even blur.
 
-    1.6 times the width of its blur in pixels: a fiber, 2 to 4 px wide, is then met by 4 or 5 of them in each pixel, and by
-    others in the next row. What is left is grain of about 1 % of white in dense hair, some twice the shot noise; more than
+    Four times the width of its blur in pixels: a fiber, 2 to 4 px wide, is then met by some 12 of them in each pixel, and by
+    others in the next row. What is left is grain of about 0.5 % of white in dense hair, not twice the shot noise; more than
     160 are not needed for any blur, since the wider it is, the less a single fiber counts.
     """
     blur_px = 2 * aperture_radius_mm(optics) * depth_mm / (optics.working_distance_mm * optics.pitch_mm)
-    return int(np.clip(1.6 * blur_px, 56, 160))
+    return int(np.clip(4 * blur_px, 56, 160))
 
 
 # ---- hair, ready to be drawn -----------------------------------------------------------------------------------------
