@@ -158,6 +158,27 @@ class Numbers(click.ParamType):
         return numbers
 
 
+class Words(click.ParamType):
+    """Words, or whole numbers, with commas between them, each one of some choices if there are any."""
+
+    name = "list"
+
+    def __init__(self, kind: type = str, choices: tuple = ()):
+        self.kind, self.choices = kind, choices
+
+    def convert(self, value, param, ctx):
+        if not isinstance(value, str):
+            return value
+        try:
+            words = tuple(self.kind(part.strip()) for part in value.split(","))
+        except ValueError:
+            self.fail(f"{value!r} is no list of whole numbers; expected A,B,C", param, ctx)
+        for word in words:
+            if self.choices and word not in self.choices:
+                self.fail(f"{word!r} is not one of {', '.join(self.choices)}", param, ctx)
+        return words
+
+
 class MosaicType(click.ParamType):
     """PATTERN:BLACK:WHITE of a bare mosaic."""
 
@@ -488,6 +509,37 @@ def score(session, strands, truth, tolerance_mm, json_file):
 
     report = score(load_strands(strands), load_truth(truth), tolerance_mm)
     _hand_over(session, report, terminal.table(summary(report)), json_file)
+
+
+@main_group.command(short_help="Measure the methods on simulated locks, in one table.")
+@click.argument("folder", type=PATH)
+@click.option("--styles", type=Words(choices=PRESETS[1:]), default="straight,wavy,curls", show_default=True, help="Kinds of hair to simulate.")
+@click.option("--fibers", type=Words(int), default="160,340,600", show_default=True, help="Numbers of hairs in a lock.")
+@click.option("--methods", type=Words(choices=("ours", "paper")), default="ours,paper", show_default=True, help="Methods to compare.")
+@click.option("--scale", type=click.Choice(["tiny", "small", "medium", "paper"]), default="medium", show_default=True, help="Size of the locks.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Another number gives other locks of the same kinds.")
+@click.option("--capture", "captures", type=PATH, multiple=True, help="Measure on this capture with its truth, too; may be given again.")
+@click.option("--jobs", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given.")
+@click.option("--again", type=click.Choice(["growing", "all"]), help="Do not keep scores: reconstruct from the ridges, or all anew.")
+@common
+@click.pass_obj
+def accuracy(session, folder, styles, fibers, methods, scale, seed, captures, jobs, again):
+    """Simulate locks of hair in FOLDER, reconstruct each without a setting, and print how well that went.
+
+    Locks and scores that are there are kept, so that an interrupted run goes on where it stopped. The table is also written
+    to accuracy.md and accuracy.json in FOLDER. The nine locks of the default need some 20 GB of disk, and hours.
+
+    \b
+    Example:
+      strandscope accuracy locks --styles straight,curls --fibers 160 --capture demo/capture
+    """
+    from . import accuracy as harness
+
+    params = harness.AccuracyParams(styles, fibers, methods, captures, scale, seed)
+    rows = list(harness.measure(folder, params, jobs, again, session.report))
+    session.report.show(harness.table(rows))
+    for written in harness.save(folder, rows):
+        session.report.done(written)
 
 
 def _hand_over(session: Session, numbers: dict, text: str, json_file: Path | None) -> None:

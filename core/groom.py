@@ -133,8 +133,7 @@ def _centres(sizes: np.ndarray, params: GroomParams, rng) -> np.ndarray:
     around = 2 * np.pi * rng.random() + order * np.pi * (3 - np.sqrt(5))
     room = params.lock_radius_mm * np.sqrt(sizes / params.fibers)
     radius = np.sqrt((order + rng.random(len(sizes))) / len(sizes)) * np.maximum(params.lock_radius_mm - 0.7 * room, 0)
-    if params.style != "straight":
-        radius *= 0.65  # waves and ringlets reach out by themselves
+    radius *= {"straight": 1.0, "wavy": 0.9, "curls": 0.65}[params.style]  # waves and ringlets reach out by themselves
     return np.stack([radius * np.cos(around), radius * np.sin(around)], axis=-1)
 
 

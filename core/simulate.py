@@ -29,10 +29,12 @@ from .raw import write_dng
 
 BLACK, WHITE = 512, 15871  # of the sensor, 14 bit
 JOURNAL = "simulation.json"  # what was asked for, to know whether a run can be continued
-REVISION = 1  # raise it when the same parameters give other photographs
+REVISION = 3  # raise it when the same parameters give other photographs
 _SITES = ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2))  # of the RGGB cell: row, column, colour
 _PROFILE = 256  # brightnesses across a fiber that are told apart
-_BARE = -1  # no fiber here
+_EDGE = 32  # columns beside an image, so that a row of a fiber is drawn whole
+_FINEST = 2**25 - 1024  # depths that are told apart
+_MOST = 2**22 - 1  # segments
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class Scale:
 SCALES = {
     "tiny": Scale(180, 150, 16, 1.8, 24, 1.5, 4),  # seconds
     "small": Scale(300, 240, 24, 3.0, 100, 2.8, 8),  # a minute
-    "medium": Scale(420, 420, 24, 6.0, 340, 4.6, 24),  # minutes
+    "medium": Scale(420, 420, 24, 6.0, 340, 5.2, 24),  # minutes: a lock of 11 mm in 12 mm
     "paper": Scale(1462, 2193, 24, 37.5, 3000, 18.0, 360),  # hours: the capture of the paper, sec. 3
 }
 
@@ -101,7 +103,8 @@ class Lens:
 
     In row r, drawing i is seen from v = v_mm[i] and u = chord * (2 * frac(phase[i] + turn[r]) - 1), with chord the disc's half
     width at that v. The points of a row are a golden-ratio lattice on the disc, even in number and in every direction; the
-    next row has another turn of it, at random, so that a blurred fiber leaves no copies of itself that run along with it.
+    next row has another turn of it, so that a blurred fiber leaves no copies of itself that run along with it, and turns of
+    neighbouring rows fill each other's gaps, so that little is left of the grain over the length of a filter for ridges.
     """
 
     radius_mm: float
@@ -123,7 +126,8 @@ def lens(count: int, radius_mm: float, rows: int, rng) -> Lens:
     share = 0.5 + (v * np.sqrt(1 - v * v) + np.arcsin(v)) / np.pi  # of the disc below v
     v = np.interp((i + rng.random()) / count, share, v)
     shift = (np.stack([i / plastic, i / plastic**2], axis=-1) + rng.random(2)) % 1.0 - 0.5
-    return Lens(radius_mm, (i * golden + rng.random()) % 1.0, radius_mm * v, shift, rng.random(rows))
+    turn = (np.arange(rows) / plastic + rng.random()) % 1.0
+    return Lens(radius_mm, (i * golden + rng.random()) % 1.0, radius_mm * v, shift, turn)
 
 
 def aperture_radius_mm(optics: Optics) -> float:
@@ -134,12 +138,12 @@ def aperture_radius_mm(optics: Optics) -> float:
 def lens_count(optics: Optics, depth_mm: float) -> int:
     """How many points on the lens make a fiber ``depth_mm`` out of focus an even blur.
 
-    1.6 times the width of its blur in pixels: a fiber, 2 to 4 px wide, is then met by 4 or 5 of them in each pixel, and by
-    others in the next row. What is left is grain of about 1 % of white in dense hair, some twice the shot noise; more than
+    Four times the width of its blur in pixels: a fiber, 2 to 4 px wide, is then met by some 12 of them in each pixel, and by
+    others in the next row. What is left is grain of about 0.5 % of white in dense hair, not twice the shot noise; more than
     160 are not needed for any blur, since the wider it is, the less a single fiber counts.
     """
     blur_px = 2 * aperture_radius_mm(optics) * depth_mm / (optics.working_distance_mm * optics.pitch_mm)
-    return int(np.clip(1.6 * blur_px, 56, 160))
+    return int(np.clip(4 * blur_px, 56, 160))
 
 
 # ---- hair, ready to be drawn -----------------------------------------------------------------------------------------
@@ -307,18 +311,23 @@ class Drawing:
 
     ends: np.ndarray  # (S, 7) float32: u', v', w of both ends, radius; mm
     strand: np.ndarray  # (S,) int32
-    colors: np.ndarray  # (S, 7) float32: R, G, B of both ends, share of the highlight
+    colors: np.ndarray  # (S, 7) float32: R, G, B of its first end, share of the highlight, what R, G, B change to the other end
+    span_mm: np.ndarray  # (2,) float32: all that is seen is in between, in w
 
 
 def drawing(hair: Hair, angle_deg: float, shaded: Shade | None = None) -> Drawing:
-    """The hair turned by an angle, ready to be drawn; without ``shaded`` it is black."""
+    """The hair turned by an angle, ready to be drawn; without ``shaded`` it is black. Raises StrandscopeError for too much hair."""
+    if len(hair.segments) > _MOST:
+        raise StrandscopeError(f"the hair has {len(hair.segments)} straight pieces; expected {_MOST} at most: fewer or shorter fibers")
     where = geometry.camera_points(hair.points_mm, angle_deg)
     order = hair.segments[np.argsort(-where[hair.segments, 1], kind="stable")]
     ends = np.column_stack([where[order], where[order + 1], hair.radius_mm[order]]).astype(np.float32)
     colors = np.zeros((len(order), 7), np.float32)
     if shaded is not None:
-        colors[:] = np.column_stack([shaded.color[order], shaded.color[order + 1], shaded.shine[order]])
-    return Drawing(ends, hair.fiber[order], colors)
+        colors[:] = np.column_stack([shaded.color[order], shaded.shine[order], shaded.color[order + 1] - shaded.color[order]])
+    thick = 4 * hair.radius_mm.max()
+    span = np.array([where[:, 2].min() - thick, where[:, 2].max() + thick], np.float32)
+    return Drawing(ends, hair.fiber[order], colors, span)
 
 
 def photograph(hair: Drawing, background: np.ndarray, optics: Optics, focus_mm: float, through: Lens) -> np.ndarray:
@@ -330,7 +339,7 @@ def photograph(hair: Drawing, background: np.ndarray, optics: Optics, focus_mm: 
     planes = background.astype(np.float32)
     view = (np.float32(focus_mm), np.float32(optics.working_distance_mm), np.float32(optics.pitch_mm))
     axis = (np.float32(optics.axis_col_px), np.float32(optics.axis_row_px))
-    _photograph(hair.ends, hair.colors, planes, background, *_lens_arrays(through), view, axis, profiles())
+    _photograph(hair.ends, hair.colors, planes, background, *_lens_arrays(through), view, axis, hair.span_mm, profiles())
     return planes
 
 
@@ -341,20 +350,28 @@ def _lens_arrays(through: Lens) -> tuple[np.ndarray, np.ndarray]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw(ends, point, turn, view, axis, depth, hit, at):
-    """Draw all segments as seen from points of the lens, one a row: depth (w), index of the segment, and place on it.
+def _draw(ends, point, turn, view, axis, span, nearest):
+    """Draw all segments as seen from points of the lens, one a row, into nearest (rows, _EDGE + columns + _EDGE) int64.
 
-    The pixel (r, c) of the buffers looks along the ray through column c, row r of the plane of focus, both shifted by
-    point[3:]. ``at`` packs the place along the segment (high byte) and q² across it (low byte). Bound by branches that
-    cannot be foreseen, about one a row of a segment.
+    Entry (r, _EDGE + c) looks along the ray through column c, row r of the plane of focus, both shifted by point[3:]. It
+    becomes 0 where no fiber is, else a number that grows with the nearness of the surface there, so that the larger of two
+    is the one to be seen: from the high bits, 25 of w between the ends of ``span`` (mm), 22 of the segment, 8 of the place
+    along it, 8 of q² across it. Bound by arithmetic: the place of a segment in its rows and a row's pixels go through
+    vectors, some 25 ns a row of a segment.
     """
-    depth[:] = -np.inf
-    hit[:] = _BARE
-    rows, columns = depth.shape
+    nearest[:] = 0
+    rows, columns = nearest.shape[0], nearest.shape[1] - 2 * _EDGE
     focus, distance, pitch = view
-    half_of, one = np.float32(0.5), np.float32(1)
-    phase, chord, lens_v, per_pitch = point[0], point[1], point[2], one / pitch
+    half_of, one, two = np.float32(0.5), np.float32(1), np.float32(2)
+    chord, lens_v, per_pitch = point[1], point[2], one / pitch
     axis_col, axis_row = axis[0] - point[3], axis[1] - point[4]
+    fine = np.float32(_FINEST) / (span[1] - span[0])
+    lens_u = np.zeros(rows + 8, np.float32)
+    for r in range(rows):
+        part = point[0] + turn[r]
+        lens_u[r] = chord * (two * (part - one if part >= one else part) - one)
+    first, places = np.empty((2, rows + 8), np.int32)
+    begin, step, high = np.empty((3, rows + 8), np.float32)
     for k in range(len(ends)):
         w0, w1, radius = ends[k, 2], ends[k, 5], ends[k, 6]
         # Seen from (L_u, L_v) a point appears at L + project(point - L), which is project(point) + L (1 - scale).
@@ -369,107 +386,106 @@ def _draw(ends, point, turn, view, axis, depth, hit, at):
         outside = max(r0, r1) < -reach or min(r0, r1) > rows + reach
         if outside or max(c0, c1) + reach < 0 or min(c0, c1) - reach > columns:
             continue
-        dr, deep = r1 - r0, (w1 - w0) * per_pitch
-        if abs(dr) < max(abs(c1 - c0) + chord * abs(sway1 - sway0), half_of * abs(deep)):
-            _draw_level(k, c0, r0, w0, c1, r1, w1, sway0, sway1, half, radius, per_pitch, phase, chord, turn, depth, hit, at)
+        dr, dc, dw, swing = r1 - r0, c1 - c0, w1 - w0, sway1 - sway0
+        deep, low, tag = dw * per_pitch, (w0 - span[0]) * fine, k << 16
+        if abs(dr) < max(abs(dc) + chord * abs(swing), half_of * abs(deep)):
+            _draw_level(tag, c0, r0, low, dc, dr, dw * fine, deep, sway0, swing, half, radius * fine, chord, lens_u, nearest)
             continue
         # Upright: each row between the ends belongs to this segment alone, so that neighbours join without a gap.
-        per_dr, dw, per_half = one / dr, w1 - w0, one / half
-        bulge = radius * math.sqrt(one + (deep * per_dr) ** 2)
-        for r in range(max(math.ceil(min(r0, r1)), 0), min(math.ceil(max(r0, r1)), rows)):
-            part = phase + turn[r]
-            lens_u = chord * (np.float32(2) * (part - one if part >= one else part) - one)
-            t = (np.float32(r) - r0) * per_dr
-            left, right = c0 + lens_u * sway0, c1 + lens_u * sway1
-            centre, lean = left + t * (right - left), (right - left) * per_dr
-            across = math.sqrt(one + lean * lean)
-            wide = half * across
-            first, last = max(math.ceil(centre - wide), 0), min(math.floor(centre + wide), columns - 1)
-            w, across = w0 + t * dw, per_half / across
-            place = int(t * np.float32(255)) << 8
-            for c in range(first, last + 1):
-                q = (np.float32(c) - centre) * across
-                q = min(q * q, np.float32(0.999))
-                near = w + bulge * math.sqrt(one - q)
-                if near > depth[r, c]:
-                    depth[r, c] = near
-                    hit[r, c] = k
-                    at[r, c] = place + int(q * np.float32(256))
+        per_dr, per_half, dlow = one / dr, one / half, dw * fine
+        bulge = radius * fine * math.sqrt(one + (deep * per_dr) ** 2)
+        top = max(math.ceil(min(r0, r1)), 0)
+        count = min(math.ceil(max(r0, r1)), rows) - top
+        for j in range(8 * ((count + 7) // 8)):  # whole vectors
+            r = top + j
+            t, lean = (np.float32(r) - r0) * per_dr, dc + lens_u[r] * swing
+            centre = c0 + lens_u[r] * sway0 + t * lean
+            across = math.sqrt(one + (lean * per_dr) ** 2)
+            left = np.ceil(centre - half * across)
+            across = per_half / across
+            first[j], begin[j], step[j] = np.int32(left), (left - centre) * across, across
+            high[j], places[j] = low + t * dlow, np.int32(t * np.float32(255)) << 8
+        wide = 8 * math.ceil((np.float32(2.9) * half + one) / np.float32(8))  # it leans by 45° at most
+        for j in range(count):
+            place = first[j] + _EDGE
+            if place < 0 or place + wide > nearest.shape[1]:
+                continue
+            pixels = nearest[top + j, place : place + wide]
+            start, by, height, name = begin[j], step[j], high[j], tag + places[j]
+            for i in range(wide):
+                q = start + np.float32(np.int32(i)) * by
+                q = q * q
+                near = np.int64(np.int32(height + bulge * math.sqrt(max(one - q, np.float32(0)))))
+                number = (near << 38) + (name + np.int64(np.int32(q * np.float32(256))))
+                pixels[i] = max(pixels[i], number if q < one else 0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw_level(k, at0, r0, w0, at1, r1, w1, sway0, sway1, half, radius, per_pitch, phase, chord, turn, depth, hit, at):
+def _draw_level(tag, at0, r0, low, along, dr, dlow, deep, sway0, swing, half, radius, chord, lens_u, nearest):
     """Draw a segment that lies level in the image or points at the camera: pixels nearer than ``half`` to its line.
 
     It is drawn on beyond its ends by half its width, over its neighbours, so that no gap opens between them.
     """
-    rows, columns = depth.shape
-    zero, half_of, one = np.float32(0), np.float32(0.5), np.float32(1)
-    dr, deep, more, per_half = r1 - r0, (w1 - w0) * per_pitch, half + np.float32(0.1), one / half
-    for r in range(max(math.ceil(min(r0, r1) - half - more), 0), min(math.floor(max(r0, r1) + half + more), rows - 1) + 1):
-        part = phase + turn[r]
-        lens_u = chord * (np.float32(2) * (part - one if part >= one else part) - one)
-        c0 = at0 + lens_u * sway0
-        dc = at1 + lens_u * sway1 - c0
+    zero, one, more, per_half = np.float32(0), np.float32(1), half + np.float32(0.1), np.float32(1) / half
+    tall = math.sqrt(half * half + more * more)  # a corner is this far from its end
+    wide = 8 * math.ceil((abs(along) + chord * abs(swing) + tall + tall + one) / np.float32(8))
+    for r in range(max(math.ceil(min(r0, r0 + dr) - tall), 0), min(math.floor(max(r0, r0 + dr) + tall) + 1, len(nearest))):
+        c0, dc = at0 + lens_u[r] * sway0, along + lens_u[r] * swing
         length = math.sqrt(dc * dc + dr * dr) + np.float32(1e-4)
         per_length = one / length
         tc, tr, y = dc * per_length, dr * per_length, np.float32(r) - r0
         bulge = radius * min(math.sqrt(one + (deep * per_length) ** 2), np.float32(4))
-        # |across| < half and -more < along < length + more each leave an interval of columns.
-        left, right = min(c0, c0 + dc) - half - more, max(c0, c0 + dc) + half + more
-        if abs(tr) > np.float32(1e-4):
-            centre, wide = c0 + y * tc / tr, half / abs(tr)
-            left, right = max(left, centre - wide), min(right, centre + wide)
-        elif abs(y) > half:
+        left = math.floor(min(c0, c0 + dc) - tall) + _EDGE
+        begin, end = max(left, 0), min(left + wide, nearest.shape[1])
+        if begin >= end:
             continue
-        if abs(tc) > np.float32(1e-4):
-            centre, wide = c0 + (half_of * length - y * tr) / tc, (half_of * length + more) / abs(tc)
-            left, right = max(left, centre - wide), min(right, centre + wide)
-        elif y * tr < -more or y * tr > length + more:
-            continue
-        for c in range(max(math.ceil(left), 0), min(math.floor(right), columns - 1) + 1):
-            x = np.float32(c) - c0
-            t, across = min(max((x * tc + y * tr) * per_length, zero), one), (x * tr - y * tc) * per_half
-            q = min(across * across, np.float32(0.999))
-            near = w0 + t * (w1 - w0) + bulge * math.sqrt(one - q)
-            if near > depth[r, c]:
-                depth[r, c] = near
-                hit[r, c] = k
-                at[r, c] = (int(t * np.float32(255)) << 8) + int(q * np.float32(256))
+        pixels, x0 = nearest[r, begin:end], np.float32(begin - _EDGE) - c0
+        for i in range(len(pixels)):
+            x = x0 + np.float32(np.int32(i))
+            s, across = x * tc + y * tr, (x * tr - y * tc) * per_half
+            t, q = min(max(s * per_length, zero), one), across * across
+            near = np.int64(np.int32(low + t * dlow + bulge * math.sqrt(max(one - q, zero))))
+            number = (near << 38) + (tag + np.int64((np.int32(t * np.float32(255)) << 8) + np.int32(q * np.float32(256))))
+            pixels[i] = max(pixels[i], number if (q < one) & (s > -more) & (s < length + more) else 0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _photograph(ends, colors, planes, background, points, turn, view, axis, across):
+def _photograph(ends, colors, planes, background, points, turn, view, axis, span, across):
     """Add to planes (4, rows, columns), per point of the lens, what the hair there differs from the background."""
     rows, columns = planes.shape[1:]
-    depth = np.empty((rows + 1, columns + 1), np.float32)
-    hit = np.empty((rows + 1, columns + 1), np.int32)
-    at = np.empty((rows + 1, columns + 1), np.uint16)
+    nearest = np.empty((rows + 1, columns + 1 + 2 * _EDGE), np.int64)
+    light = np.empty((rows + 1, columns + 1, 4), np.float32)
     share = np.float32(1 / len(points))
-    for i in range(len(points)):
-        _draw(ends, points[i], turn, view, axis, depth, hit, at)
-        # The ray of buffer pixel (r, c) meets the plane of focus at (r, c) + shift: within half a pixel of the red site of
-        # cell (r, c), and of the sites half a pixel further of cell (r, c), or of the one before, if the shift is negative.
-        before_c, before_r = int(points[i, 3] < 0), int(points[i, 4] < 0)
-        for r in range(rows + 1):
-            for c in range(columns + 1):
-                k = hit[r, c]
-                if k == _BARE:
-                    continue
-                t = np.float32(at[r, c] >> 8) / np.float32(255)
-                q = at[r, c] & 255
-                shine = colors[k, 6]
-                bright = share * ((1 - shine) * across[0, q] + shine * across[1, q])
-                green = bright * (colors[k, 1] + t * (colors[k, 4] - colors[k, 1]))
-                r1, c1 = r - before_r, c - before_c
-                if r < rows and c < columns:
-                    planes[0, r, c] += bright * (colors[k, 0] + t * (colors[k, 3] - colors[k, 0])) - share * background[0, r, c]
-                if r < rows and 0 <= c1 < columns:
-                    planes[1, r, c1] += green - share * background[1, r, c1]
-                if 0 <= r1 < rows and c < columns:
-                    planes[2, r1, c] += green - share * background[2, r1, c]
-                if 0 <= r1 < rows and 0 <= c1 < columns:
-                    planes[3, r1, c1] += bright * (colors[k, 2] + t * (colors[k, 5] - colors[k, 2])) - share * background[3, r1, c1]
+    # The ray of entry (r, c) meets the plane of focus at (r, c) + shift: within half a pixel of the red site of cell (r, c),
+    # and of the sites half a pixel further of cell (r, c), or of the one before, if the shift is negative.
+    for before_r in range(2):
+        for before_c in range(2):
+            light[:] = 0
+            for i in range(len(points)):
+                if before_c == int(points[i, 3] < 0) and before_r == int(points[i, 4] < 0):
+                    _draw(ends, points[i], turn, view, axis, span, nearest)
+                    _light(nearest, colors, across, light)
+            for r in range(rows):
+                for c in range(columns):
+                    for site in range(4):
+                        down, right, color = _SITES[site]
+                        r1, c1 = r + down * before_r, c + right * before_c
+                        planes[site, r, c] += share * (light[r1, c1, color] - light[r1, c1, 3] * background[site, r, c])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _light(nearest, colors, across, light):
+    """Add the light of what is nearest to light (rows, columns, 4): R, G, B, and 1 where there is hair."""
+    for r in range(nearest.shape[0]):
+        for c in range(nearest.shape[1] - 2 * _EDGE):
+            number = nearest[r, _EDGE + c]
+            if number == 0:
+                continue
+            k, t, q = (number >> 16) & _MOST, np.float32((number >> 8) & 255) / np.float32(255), number & 255
+            bright = across[0, q] + colors[k, 3] * (across[1, q] - across[0, q])
+            for color in range(3):
+                light[r, c, color] += bright * (colors[k, color] + t * colors[k, 4 + color])
+            light[r, c, 3] += np.float32(1)
 
 
 def expose(planes: np.ndarray, full_well_e: float, read_noise_e: float, rng) -> np.ndarray:
@@ -532,7 +548,8 @@ def visibility(hair: Hair, at: Samples, optics: Optics, angle_deg: float, rays: 
         view = (np.float32((level + 0.5) * slab_mm), np.float32(optics.working_distance_mm), np.float32(pitch))
         axis = (np.float32(-low[0] / pitch), np.float32(high[1] / pitch))
         spots, turn = _lens_arrays(aperture_rays(optics, rays, rows))
-        seen[chosen] = _visible(drawn.ends, drawn.strand, spots, turn, points.astype(np.float32), at.strand[chosen], view, axis, (rows, columns))
+        hair_at = drawn.ends, drawn.strand, drawn.span_mm
+        seen[chosen] = _visible(*hair_at, spots, turn, points.astype(np.float32), at.strand[chosen], view, axis, (rows, columns))
     return seen
 
 
@@ -543,19 +560,21 @@ def aperture_rays(optics: Optics, rays: int, rows: int = 1) -> Lens:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _visible(ends, strand, spots, turn, points, own, view, axis, shape):
+def _visible(ends, strand, span, spots, turn, points, own, view, axis, shape):
     """Fraction (K,) of points of the lens from which points (K, 3) of the camera frame on strands own (K,) are seen."""
-    depth, hit, at = np.empty(shape, np.float32), np.empty(shape, np.int32), np.empty(shape, np.uint16)
+    nearest = np.empty((shape[0], shape[1] + 2 * _EDGE), np.int64)
     count = np.zeros(len(points))
+    coarse = (span[1] - span[0]) / np.float32(_FINEST)
     for i in range(len(spots)):
-        _draw(ends, spots[i], turn, view, axis, depth, hit, at)
+        _draw(ends, spots[i], turn, view, axis, span, nearest)
         lens_u, lens_v = spots[i, 1] * (np.float32(2) * spots[i, 0] - np.float32(1)), spots[i, 2]
         for k in range(len(points)):
             w = points[k, 2]
             u, v = _project(points[k, 0] - lens_u, points[k, 1] - lens_v, w, view[0], view[1])
             c, r = _to_pixel(lens_u + u, lens_v + v, view[2], axis[0] - spots[i, 3], axis[1] - spots[i, 4])
-            found, nearer = hit[round(r), round(c)], depth[round(r), round(c)] - w
-            itself = found == _BARE or (strand[found] == own[k] and nearer < 0.5)
+            found = nearest[round(r), _EDGE + round(c)]
+            nearer = span[0] + np.float32(found >> 38) * coarse - w
+            itself = found == 0 or (strand[(found >> 16) & _MOST] == own[k] and nearer < 0.5)
             count[k] += 1.0 if itself or nearer <= 0 else 0.0
     return count / len(spots)
 
@@ -647,7 +666,7 @@ def _photographs(capture: Capture, hair: Hair, params: SimulateParams, progress:
     background = board(optics, (scale.rows, scale.columns), look)
     fog = density(hair)
     gain = _gain(hair, fog, look, params)
-    reach = float(np.hypot(hair.points_mm[:, 0], hair.points_mm[:, 2]).max())
+    reach = float(np.percentile(np.hypot(hair.points_mm[:, 0], hair.points_mm[:, 2]), 99))  # few fibers fly off farther
     stopped = replace(optics, aperture_cone_deg=stopped_cone_deg(params))
     sequences = [(s.angle_deg, d, f, optics) for s in capture.sweeps for d, f in zip(s.positions_mm, s.files, strict=True)]
     sequences += [(a, capture.turntable.focus_mm, f, stopped) for a, f in zip(capture.turntable.angles_deg, capture.turntable.files, strict=True)]
