@@ -427,9 +427,10 @@ def calibrate(session, capture, output, params, workers, memory):
     show_default=True,
     help="Each curve in a colour of its own, or captured hairs and infill told apart.",
 )
+@click.option("--calibration", type=PATH, help="What is wrong with the rig, if the curves were made with it.")
 @common
 @click.pass_obj
-def overlay(session, capture, strands, output, sweep, angle, position, color):
+def overlay(session, capture, strands, output, sweep, angle, position, color, calibration):
     """Draw the curves of a strands file back onto a photograph of CAPTURE, to see whether they lie on the hairs.
 
     The picture shows the photograph, the ridges that were found in it, and the curves over the photograph. Only the parts of
@@ -446,6 +447,10 @@ def overlay(session, capture, strands, output, sweep, angle, position, color):
     if sweep is not None and angle is not None:
         raise click.UsageError("--sweep and --angle exclude each other")
     photographs, curves = load_capture(capture), load_strands(strands)
+    if calibration:
+        from .rig.calibrate import load_errors
+
+        photographs = load_errors(calibration).corrected(photographs)
     shot = compare.choose_shot(photographs, curves, sweep, angle, position)
     session.report.show(compare.overlay(photographs, curves, shot, output, color))
     session.report.done(output)

@@ -12,7 +12,7 @@ from .rig.calibrate import Sightings
 _turn, _slope, _to_pixel = njit(turn), njit(slope), njit(to_pixel)
 ROUNDS = 10  # of a window that moves with the observations in it
 MAX_HITS = 2048  # observations of a sweep that one point looks at
-CLEAR = 0.5  # share of the sightings that are too faint to tell a depth
+CLEAR = 0.6  # share of the sightings that are too faint to tell a depth
 CLEAREST = 0.98  # quantile of the strengths that faintness is told from
 CROWD_MM = (1.0, 3.0)  # how far to the sides, and before and behind, hair is looked for that disturbs the depth
 OWN_MM = (0.06, 0.6)  # the hair itself, as far
@@ -52,7 +52,7 @@ def sightings(index: Index, points_mm: np.ndarray, tangents: np.ndarray, reach: 
     clear, clearest = np.quantile(peak[depth], (CLEAR, CLEAREST)) if depth.any() else (0.0, 1.0)
     rows = rows[~depth | (peak >= clear)]
     before, behind = rows[:, 13], rows[:, 14]
-    crowd = (before - behind) / (before + behind + 0.1 * np.mean(before + behind) + 1e-12)
+    crowd = (before - behind) / (before + behind + 0.1 * np.sum(before + behind) / max(len(rows), 1) + 1e-12)
     faint = np.log(clearest / np.maximum(rows[:, 12], 1e-9))
     whole = (rows[:, i].astype(np.int64) for i in (0, 1))
     return Sightings(*whole, rows[:, 2] > 0, rows[:, 3], rows[:, 4:7], rows[:, 7:10], rows[:, 10:12], crowd, faint)

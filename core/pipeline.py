@@ -32,6 +32,7 @@ from .rig.calibrate import (
     ANGLE_FLOOR_DEG,
     FIRST_SWEEP,
     SURE,
+    TUKEY,
     Calibration,
     RigErrors,
     Solution,
@@ -239,6 +240,7 @@ LEAST_DRIFT = 0.003  # parts of the light, below which a drift is not corrected
 # what is not explained by scatter, found on simulated locks with known rigs: depth from focus is biased by the hair around it
 FLOOR = RigErrors(axis_px=0.003, tilt_deg=0.001, tilt_towards_deg=0.005, focus_mm=0.004)
 FLOOR_SCALE = 0.0003
+TUKEY_FAR = 2.5  # in rounds where curves may lie far off: many observations are then those of other hairs
 SETTLED = 0.1  # a round that changes nothing by more than this many standard errors is the last
 
 
@@ -277,12 +279,13 @@ def _solved(capture: Capture, sweeps: list[SweepFeatures], parameters: Parameter
         if number in GROWN_IN:
             points, tangents = _on_curves(grow(index, parameters.grow, workers, growing))
         found = sightings(index, points, tangents, _reach(reach_px, rig.optics, parameters), np.radians(rig.optics.tilt_towards_deg))
-        solution = solve(found, len(sweeps))
+        last = reach_px == ROUNDS_PX[-1]
+        solution = solve(found, len(sweeps), TUKEY if last else TUKEY_FAR)
         errors = errors.plus(solution.change, capture)
         moves = np.clip(solution.moves, -2 * reach_px * index.pitch, 2 * reach_px * index.pitch)
         points[solution.points] += np.einsum("ps,psi->pi", moves, sides_of(tangents[solution.points]))
         spread = np.sqrt(np.diag(solution.covariance))
-        if reach_px == ROUNDS_PX[-1] and np.all(np.abs(solution.change) <= SETTLED * spread):
+        if last and np.all(np.abs(solution.change) <= SETTLED * spread):
             break
     progress("calibrating", len(ROUNDS_PX), len(ROUNDS_PX))
     return errors, solution

@@ -339,8 +339,8 @@ class Drawing:
     colors: np.ndarray  # (S, 7) float32: R, G, B of both ends, share of the highlight
 
 
-def drawing(hair: Hair, angle_deg: float, optics: Optics, shaded: Shade | None = None) -> Drawing:
-    """The hair turned by an angle, ready to be drawn; without ``shaded`` it is black."""
+def drawing(hair: Hair, angle_deg: float, shaded: Shade | None = None, optics: Optics | None = None) -> Drawing:
+    """The hair turned by an angle, ready to be drawn; without ``shaded`` it is black, without ``optics`` the axis is upright."""
     where = geometry.camera_points(hair.points_mm, angle_deg, optics)
     order = hair.segments[np.argsort(-where[hair.segments, 1], kind="stable")]
     ends = np.column_stack([where[order], where[order + 1], hair.radius_mm[order]]).astype(np.float32)
@@ -550,7 +550,7 @@ def visibility(hair: Hair, at: Samples, optics: Optics, angle_deg: float, rays: 
     seen = np.zeros(len(where))
     if not len(where):
         return seen
-    drawn = drawing(hair, angle_deg, optics)
+    drawn = drawing(hair, angle_deg, optics=optics)
     pitch = optics.pitch_mm / 2
     slab = np.floor(where[:, 2] / slab_mm)
     for level in np.unique(slab):
@@ -692,7 +692,7 @@ def _photographs(capture: Capture, hair: Hair, params: SimulateParams, progress:
         if not missing:
             continue
         shaded = shade(hair, fog, look, angle, optics.working_distance_mm)
-        drawn = drawing(hair, angle, optics, replace(shaded, color=shaded.color * np.float32(gain)))
+        drawn = drawing(hair, angle, replace(shaded, color=shaded.color * np.float32(gain)), optics)
 
         def take(shot, drawn=drawn):
             number, focus, file, through, brighter = shot

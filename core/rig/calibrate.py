@@ -30,7 +30,7 @@ FORMAT, VERSION = "strandscope-calibration", 1
 RIG = ("axis", "tilt", "tilt_towards", "focus", "scale")  # unknowns of the whole rig: mm, rad, rad, mm, parts
 BIASES = 2  # and of depth from focus: by crowding, by faintness; mm
 FIRST_SWEEP = len(RIG) + BIASES  # place of the first sweep's angle (rad) among the unknowns
-TUKEY = 3.0  # observations this many robust deviations off are not heard
+TUKEY = 4.0  # observations this many robust deviations off are not heard
 LEAST_SIGMA_MM = 1e-6
 LEAST_SIGHTINGS = 3  # of a point across the line of sight
 SURE = 3.0  # an error of this many standard errors is one
@@ -128,8 +128,9 @@ class Solution:
     depth_mm: float  # and in depth
 
 
-def solve(sightings: Sightings, sweeps: int, iterations: int = 15) -> Solution:
-    """The errors of the rig by which the sightings agree best, and their covariance. Robust (Tukey's biweight).
+def solve(sightings: Sightings, sweeps: int, tukey: float = TUKEY, iterations: int = 15) -> Solution:
+    """The errors of the rig by which the sightings agree best, and their covariance. Robust: observations off by ``tukey``
+    standard deviations are not heard (Tukey's biweight).
 
     Raises StrandscopeError where the sightings are too few.
     """
@@ -142,6 +143,7 @@ def solve(sightings: Sightings, sweeps: int, iterations: int = 15) -> Solution:
     jacobian = _jacobian(s)
     rows = (starts, s.sweep, s.moved, s.off, jacobian)
     weight = 1 / np.array([_spread(s.off[kind == 0]), _spread(s.off[kind == 1])])[kind] ** 2
+    fitted = np.sqrt(len(s.point) / (len(s.point) - 2 * (len(starts) - 1)))  # the points' own motion takes up some of the scatter
     for _ in range(iterations):
         normal, right = _eliminate(*rows, weight, count)
         free = np.setdiff1d(np.flatnonzero(np.diag(normal) > 0), FIRST_SWEEP)
@@ -150,8 +152,8 @@ def solve(sightings: Sightings, sweeps: int, iterations: int = 15) -> Solution:
         change = np.zeros(count)
         change[free] = inverse @ right[free]
         left, moves = _residuals(*rows, weight, change)
-        sigma = np.array([_spread(left[kind == 0]), _spread(left[kind == 1])])
-        weight = np.clip(1 - (left / (TUKEY * sigma[kind])) ** 2, 0, None) ** 2 / sigma[kind] ** 2
+        sigma = fitted * np.array([_spread(left[kind == 0]), _spread(left[kind == 1])])
+        weight = np.clip(1 - (left / (tukey * sigma[kind])) ** 2, 0, None) ** 2 / sigma[kind] ** 2
     covariance = np.zeros((count, count))
     covariance[np.ix_(free, free)] = inverse
     return Solution(change, covariance, s.point[starts[:-1]], moves, float(sigma[0]), float(sigma[1]))
