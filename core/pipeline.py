@@ -241,6 +241,7 @@ LEAST_DRIFT = 0.003  # parts of the light, below which a drift is not corrected
 FLOOR = RigErrors(axis_px=0.003, tilt_deg=0.001, tilt_towards_deg=0.005, focus_mm=0.004)
 FLOOR_SCALE = 0.0003
 TUKEY_FAR = 2.5  # in rounds where curves may lie far off: many observations are then those of other hairs
+REGROW_PX = 0.25  # that the rig moved the hair since the curves were grown
 SETTLED = 0.1  # a round that changes nothing by more than this many standard errors is the last
 
 
@@ -267,7 +268,7 @@ def calibrate(
 
 def _solved(capture: Capture, sweeps: list[SweepFeatures], parameters: Parameters, workers: int, progress: Progress) -> tuple[RigErrors, Solution]:
     """The errors of the rig by which the sweeps' features agree best."""
-    errors = RigErrors()
+    errors, moved_px = RigErrors(), np.inf
     for number, reach_px in enumerate(ROUNDS_PX):
 
         def growing(_stage, done, total, number=number):
@@ -276,12 +277,15 @@ def _solved(capture: Capture, sweeps: list[SweepFeatures], parameters: Parameter
         growing("", 0, 1)
         rig = errors.corrected(capture)
         index = build_index([seen_by(f, s, rig.optics) for f, s in zip(sweeps, rig.sweeps, strict=True)], rig.optics)
-        if number in GROWN_IN:
+        if number in GROWN_IN and moved_px > REGROW_PX:
+            moved_px = 0.0
             points, tangents = _on_curves(grow(index, parameters.grow, workers, growing))
         found = sightings(index, points, tangents, _reach(reach_px, rig.optics, parameters), np.radians(rig.optics.tilt_towards_deg))
         last = reach_px == ROUNDS_PX[-1]
         solution = solve(found, len(sweeps), TUKEY if last else TUKEY_FAR)
         errors = errors.plus(solution.change, capture)
+        half = np.array([1, 0.5 * index.rows * index.pitch, *[0.5 * index.columns * index.pitch] * len(sweeps)])  # mm: of the picture
+        moved_px += np.abs(solution.change[[0, 1, *range(FIRST_SWEEP, len(solution.change))]] * half).max() / index.pitch
         moves = np.clip(solution.moves, -2 * reach_px * index.pitch, 2 * reach_px * index.pitch)
         points[solution.points] += np.einsum("ps,psi->pi", moves, sides_of(tangents[solution.points]))
         spread = np.sqrt(np.diag(solution.covariance))

@@ -365,8 +365,9 @@ def describe(calibration: Calibration) -> list[tuple[str, str] | None]:
         row("tilt towards", errors.tilt_towards_deg, uncertain.tilt_towards_deg, ".4f", "°", "its upper end towards the camera"),
         row("focus", errors.focus_mm, uncertain.focus_mm, ".4f", "mm", "towards the camera"),
         row("working distance", errors.working_distance_mm, uncertain.working_distance_mm, ".2f", "mm", "with the camera's field of view as stated"),
-        row("every step", *calibration.every_step_deg, ".4f", "°", "too far"),
     ]
+    if calibration.every_step_deg != (0.0, 0.0):
+        rows.append(row("every step", *calibration.every_step_deg, ".4f", "°", "too far"))
     rows += [row(f"step to sweep {s.sweep}", s.angle_deg, s.error_deg, ".4f", "°", "too far, once") for s in calibration.slips]
     off, known = np.array(errors.angles_deg), np.array(uncertain.angles_deg)
     rows.append(("sweeps", f"{off.min():+.4f} … {off.max():+.4f} °, each ± {np.median(known[1:] if len(known) > 1 else known):.4f}"))
