@@ -38,8 +38,9 @@ def sides_of(tangents: np.ndarray) -> np.ndarray:
     return np.stack([first, np.cross(tangents, first)], axis=1)
 
 
-def sightings(index: Index, points_mm: np.ndarray, tangents: np.ndarray, reach: Reach, towards: float = 0.0) -> Sightings:
-    """How the observations of every sweep lie off points (n, 3) of curves with unit tangents (n, 3), object frame.
+def sightings(index: Index, points_mm: np.ndarray, tangents: np.ndarray, bends: np.ndarray, reach: Reach, towards: float = 0.0) -> Sightings:
+    """How the observations of every sweep lie off points (n, 3) of curves with unit tangents (n, 3) and curvature vectors ``bends``
+    (n, 3), 1/mm, towards the centre of curvature; object frame.
 
     One sighting in the image where a sweep has observations enough, and one in depth where they are clear as well. ``moved``
     is told for the directions of ``sides_of``. towards: the tilt of the axis towards the camera (rad), of which features were
@@ -47,15 +48,17 @@ def sightings(index: Index, points_mm: np.ndarray, tangents: np.ndarray, reach: 
     """
     rows = np.empty((len(points_mm) * len(index.cos) * 2, COLUMNS))
     points, along = (np.ascontiguousarray(a, np.float64) for a in (points_mm, tangents))
-    rows = rows[: _sightings(index, points, along, sides_of(along), reach, np.sin(towards), rows)]
+    sides = sides_of(along)
+    rows = rows[: _sightings(index, points, along, sides, reach, np.sin(towards), rows)]
     depth, peak = rows[:, 2] > 0, rows[:, 12]
     clear, clearest = np.quantile(peak[depth], (CLEAR, CLEAREST)) if depth.any() else (0.0, 1.0)
     rows = rows[~depth | (peak >= clear)]
     before, behind = rows[:, 13], rows[:, 14]
     crowd = (before - behind) / (before + behind + 0.1 * np.sum(before + behind) / max(len(rows), 1) + 1e-12)
     faint = np.log(clearest / np.maximum(rows[:, 12], 1e-9))
-    whole = (rows[:, i].astype(np.int64) for i in (0, 1))
-    return Sightings(*whole, rows[:, 2] > 0, rows[:, 3], rows[:, 4:7], rows[:, 7:10], rows[:, 10:12], crowd, faint)
+    point, sweep = (rows[:, i].astype(np.int64) for i in (0, 1))
+    bend = (np.einsum("pi,psi->ps", bends, sides)[point] * rows[:, 10:12]).sum(axis=1)
+    return Sightings(point, sweep, rows[:, 2] > 0, rows[:, 3], rows[:, 4:7], rows[:, 7:10], rows[:, 10:12], crowd, faint, bend)
 
 
 @njit(cache=True, nogil=True)

@@ -9,8 +9,9 @@ What the photographs cannot tell is fixed: the first sweep's angle is right by d
 ``axis_row_px``, and distances by the stage that moves the camera, through depth from focus.
 
 Depth from focus is off where other hairs are near: a hair that others half cover is seen sharpest behind its true place, and
-blurred light of neighbours before it moves the best contrast towards them. Both biases are in the system as unknowns of their
-own, in proportion to how faint the hair is and to how the hair around it is shared between before and behind.
+blurred light of neighbours before it moves the best contrast towards them. Where a hair bends away from the camera, what is
+seen of it over a short length lies behind the point. These biases are in the system as unknowns of their own, in proportion
+to how faint the hair is, to how the hair around it is shared between before and behind, and to its curvature.
 """
 
 import json
@@ -28,7 +29,7 @@ from ..files import atomic
 
 FORMAT, VERSION = "strandscope-calibration", 1
 RIG = ("axis", "tilt", "tilt_towards", "focus", "scale")  # unknowns of the whole rig: mm, rad, rad, mm, parts
-BIASES = 2  # and of depth from focus: by crowding, by faintness; mm
+BIASES = 3  # and of depth from focus: by crowding, by faintness (mm), by curvature (mm²)
 FIRST_SWEEP = len(RIG) + BIASES  # place of the first sweep's angle (rad) among the unknowns
 TUKEY = 4.0  # observations this many robust deviations off are not heard
 LEAST_SIGMA_MM = 1e-6
@@ -114,23 +115,24 @@ class Sightings(NamedTuple):
     moved: np.ndarray  # (R, 2): what moving the point by 1 mm in either direction perpendicular to the fiber is along ``way``
     crowd: np.ndarray  # (R,) hair around it, before minus behind, -1 … 1
     faint: np.ndarray  # (R,) how much weaker than the clearest hair it is, logarithm
+    bend: np.ndarray  # (R,) 1/mm: curvature of the fiber along ``way``
 
 
 @dataclass(frozen=True)
 class Solution:
     """One step towards the true rig."""
 
-    change: np.ndarray  # (7 + sweeps,): what to add to the errors known so far, in the order of RIG, biases, sweeps
-    covariance: np.ndarray  # (7 + sweeps, 7 + sweeps)
+    change: np.ndarray  # (8 + sweeps,): what to add to the errors known so far, in the order of RIG, biases, sweeps
+    covariance: np.ndarray  # (8 + sweeps, 8 + sweeps)
     points: np.ndarray  # (P,) numbers of the points that were seen
     moves: np.ndarray  # (P, 2) mm: where they go, perpendicular to the fiber
     across_mm: float  # robust standard deviation of what is left, across the line of sight
     depth_mm: float  # and in depth
 
 
-def solve(sightings: Sightings, sweeps: int, tukey: float = TUKEY, iterations: int = 15) -> Solution:
+def solve(sightings: Sightings, sweeps: int, *, tukey: float = TUKEY, biased: bool = True, iterations: int = 15) -> Solution:
     """The errors of the rig by which the sightings agree best, and their covariance. Robust: observations off by ``tukey``
-    standard deviations are not heard (Tukey's biweight).
+    standard deviations are not heard (Tukey's biweight). Unless ``biased``, depth from focus is taken as it is.
 
     Raises StrandscopeError where the sightings are too few.
     """
@@ -141,9 +143,13 @@ def solve(sightings: Sightings, sweeps: int, tukey: float = TUKEY, iterations: i
         raise StrandscopeError(f"{len(s.point)} sightings of fibers are too few to find {count} errors of a rig; expected {20 * count} or more")
     starts = np.flatnonzero(np.r_[True, np.diff(s.point) != 0, True])
     jacobian = _jacobian(s)
+    if not biased:
+        jacobian[:, len(RIG) : FIRST_SWEEP] = 0
     rows = (starts, s.sweep, s.moved, s.off, jacobian)
     weight = 1 / np.array([_spread(s.off[kind == 0]), _spread(s.off[kind == 1])])[kind] ** 2
-    fitted = np.sqrt(len(s.point) / (len(s.point) - 2 * (len(starts) - 1)))  # the points' own motion takes up some of the scatter
+    # the points' own motion takes up scatter across the line of sight, where it is told so much better than in depth
+    across = np.count_nonzero(kind == 0)
+    fitted = np.array([np.sqrt(across / max(across - 2 * (len(starts) - 1), 1)), 1.0])
     for _ in range(iterations):
         normal, right = _eliminate(*rows, weight, count)
         free = np.setdiff1d(np.flatnonzero(np.diag(normal) > 0), FIRST_SWEEP)
@@ -165,12 +171,12 @@ def _spread(values: np.ndarray) -> float:
 
 
 def _jacobian(s: Sightings) -> np.ndarray:
-    """(R, 8): by how much the offset of a row grows with each unknown of RIG, each bias, and the angle of its sweep."""
+    """(R, 9): by how much the offset of a row grows with each unknown of RIG, each bias, and the angle of its sweep."""
     u, v, w = s.at.T
     zero, one = np.zeros_like(u), np.ones_like(u)
     moves = [(-one, zero, zero), (-v, u, zero), (zero, w, -v), (zero, zero, one), (u, v, zero), (-w, zero, u)]
     rig = [(s.way * np.stack(move, axis=1)).sum(axis=1) for move in moves]
-    return np.stack([*rig[:-1], -(s.depth * s.crowd), -(s.depth * s.faint), rig[-1]], axis=1)
+    return np.stack([*rig[:-1], -(s.depth * s.crowd), -(s.depth * s.faint), -(s.depth * s.bend), rig[-1]], axis=1)
 
 
 @njit(cache=True, nogil=True)
