@@ -35,7 +35,8 @@ TUKEY = 4.0  # observations this many robust deviations off are not heard
 LEAST_SIGMA_MM = 1e-6
 LEAST_SIGHTINGS = 3  # of a point across the line of sight
 SURE = 3.0  # an error of this many standard errors is one
-ANGLE_FLOOR_DEG = 0.003  # errors of angles beyond what the sightings' scatter explains
+SURE_SLIP = 5.0  # and a step of the turntable that slipped
+ANGLE_FLOOR_DEG = 0.006  # errors of angles beyond what the sightings' scatter explains, on simulated locks
 MOST_SLIPS = 6
 BLOCK_PX = 16  # of pictures of the light
 BOARD_SHARE, BOARD_BLUE = 0.03, 0.5  # of the blocks, the bluest, that are looked at for the board; the least blue of it
@@ -262,8 +263,8 @@ def turns(angles_deg: np.ndarray, covariance: np.ndarray) -> tuple[tuple[float, 
     """What the errors of the sweeps' angles (n,), with covariance (n, n) in square degrees, have in common: by how much every
     step turns too far, with its standard error, and the steps that slipped. The first angle is 0 by definition.
 
-    A slip or a slope is taken in, the better first, while it explains more than ``SURE`` standard errors squared and a margin
-    for the many that were tried.
+    A slip or a slope is taken in, the better first, while it is sure by ``SURE_SLIP`` standard errors: many are tried, and the
+    errors of neighbouring sweeps, which see the same hair, go together.
     """
     count = len(angles_deg)
     k = np.arange(count)
@@ -271,7 +272,7 @@ def turns(angles_deg: np.ndarray, covariance: np.ndarray) -> tuple[tuple[float, 
     inverse = np.linalg.inv(covariance + (ANGLE_FLOOR_DEG**2) * np.eye(count))
     candidates = {0: (k - k.mean()) / max(count - 1, 1), **{i: (k >= i).astype(float) for i in range(1, count)}}
     chosen: list[int] = []
-    enough = SURE**2 + 2 * np.log(count)
+    enough = SURE_SLIP**2
     _, chi = _weighted_fit(angles_deg, inverse, [])
     while len(chosen) < min(count - 2, MOST_SLIPS):
         trials = {i: _weighted_fit(angles_deg, inverse, [candidates[j] for j in [*chosen, i]])[1] for i in candidates if i not in chosen}
