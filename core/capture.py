@@ -5,7 +5,7 @@ A capture is a folder with ``capture.json`` and photographs; nothing in it is re
 
 import json
 import re
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -27,6 +27,7 @@ class Sweep:
     angle_deg: float
     positions_mm: tuple[float, ...]  # d of each photograph: rotation axis to plane of focus, positive towards the camera
     files: tuple[str, ...]  # relative to the capture's folder, forward slashes
+    gains: tuple[float, ...] = ()  # of each photograph: it has this many times the light it should have; empty: all alike
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,15 @@ class Capture:
     unknown: dict = field(default_factory=dict)
 
     def planes(self, file: str, channels: str = "R") -> np.ndarray:
-        """Channel planes (len(channels), H, W) float32 of one photograph, black 0, white 1. Raises CaptureError."""
-        return read_planes(self.folder / file, channels, self.mosaic)
+        """Channel planes (len(channels), H, W) float32 of one photograph, black 0, white 1; its gain is taken out. Raises CaptureError."""
+        planes = read_planes(self.folder / file, channels, self.mosaic)
+        gain = self.gains.get(file, 1.0)
+        return planes if gain == 1.0 else planes / np.float32(gain)
+
+    @cached_property
+    def gains(self) -> dict[str, float]:
+        """Gain of each photograph that has one, by its file."""
+        return {file: gain for sweep in self.sweeps for file, gain in zip(sweep.files, sweep.gains, strict=False)}
 
     @cached_property
     def shape(self) -> tuple[int, int]:
@@ -104,7 +112,8 @@ def _sweep_json(sweep: Sweep) -> dict:
     step = round((positions[-1] - positions[0]) / max(len(positions) - 1, 1), 9)
     even = np.allclose(positions, positions[0] + step * np.arange(len(positions)), rtol=0, atol=1e-7)
     where = {"first_mm": float(positions[0]), "step_mm": float(step)} if even else {"positions_mm": list(sweep.positions_mm)}
-    return {"angle_deg": sweep.angle_deg, **where, "files": list(sweep.files)}
+    gains = {"gains": list(sweep.gains)} if sweep.gains else {}
+    return {"angle_deg": sweep.angle_deg, **where, "files": list(sweep.files), **gains}
 
 
 class _Reader:
@@ -145,7 +154,10 @@ class _Reader:
             first, step = (self._number(self._get(sweep, k, object, "a number", where), f"{where}.{k}") for k in ("first_mm", "step_mm"))
             self._expect(step != 0 or len(files) == 1, f"{where}.step_mm", step, "a step other than 0")
             positions = tuple(first + step * i for i in range(len(files)))
-        return Sweep(self._number(self._get(sweep, "angle_deg", object, "degrees", where), f"{where}.angle_deg"), positions, files)
+        gains = self._numbers(sweep["gains"], f"{where}.gains") if "gains" in sweep else ()
+        self._expect(len(gains) in (0, len(files)), f"{where}.gains", f"{len(gains)} numbers", f"{len(files)}, one a file")
+        self._expect(all(gain > 0 for gain in gains), f"{where}.gains", list(gains), "numbers more than 0")
+        return Sweep(self._number(self._get(sweep, "angle_deg", object, "degrees", where), f"{where}.angle_deg"), positions, files, gains)
 
     def _turntable(self, table) -> Turntable:
         self._expect(isinstance(table, dict), "turntable", table, "an object")
@@ -164,7 +176,8 @@ class _Reader:
         return Mosaic(pattern, int(black), int(white))
 
     def _record(self, kind, values: dict, where: str):
-        return kind(**{f.name: self._number(self._get(values, f.name, object, "a number", where), f"{where}.{f.name}") for f in fields(kind)})
+        asked = [f.name for f in fields(kind) if f.name in values or f.default is MISSING]
+        return kind(**{name: self._number(self._get(values, name, object, "a number", where), f"{where}.{name}") for name in asked})
 
     def _get(self, values: dict, name: str, kind: type, expected: str, where: str = ""):
         full = f"{where}.{name}" if where else name

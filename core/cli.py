@@ -220,9 +220,18 @@ def main_group():
 )
 @click.option("--fibers", type=click.IntRange(1), help="Number of hairs, in place of the scale's own.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Another number gives another lock of the same kind.")
+@click.option("--misaligned", is_flag=True, help="Photograph with a rig that is off in all of the following ways at once.")
+@click.option("--axis-off-px", type=float, metavar="PX", help="The turntable's axis is this much right of where capture.json says.  [misaligned: 3]")
+@click.option("--tilt-deg", type=float, metavar="DEG", help="The axis leans to the right in the image.  [misaligned: 0.2]")
+@click.option("--tilt-towards-deg", type=float, metavar="DEG", help="The axis leans towards the camera.  [misaligned: 0.2]")
+@click.option("--focus-off-mm", type=float, metavar="MM", help="The planes of focus are nearer to the camera.  [misaligned: 0.2]")
+@click.option("--working-distance-off-mm", type=float, metavar="MM", help="The plane of focus is farther from the lens.  [misaligned: 2]")
+@click.option("--turntable-step-off-deg", type=float, metavar="DEG", help="One step, in the middle, turns too far.  [misaligned: 0.1]")
+@click.option("--every-step-off-deg", type=float, metavar="DEG", help="Every step turns too far.  [misaligned: 0]")
+@click.option("--gain-drift", type=float, metavar="PARTS", help="Photographs gain light from the first to the last of a sweep.  [misaligned: 0.05]")
 @common
 @click.pass_obj
-def simulate(session, out, style, scale, fibers, seed):
+def simulate(session, out, style, scale, fibers, seed, misaligned, **off):
     """Photograph hair that is known: make a capture in the folder OUT from simulated fibers.
 
     Leaves raw photographs (DNG), capture.json, and truth.npz, which says where every hair really is, so that a
@@ -231,10 +240,13 @@ def simulate(session, out, style, scale, fibers, seed):
     \b
     Example:
       strandscope simulate lock --style wavy --scale tiny
+      strandscope simulate crooked --scale tiny --misaligned
     """
     from . import simulate as simulator
 
-    simulator.simulate(out, simulator.SimulateParams(style=style, scale=scale, fibers=fibers, seed=seed), session.report)
+    rig = simulator.MISALIGNED if misaligned else simulator.Misalignment()
+    rig = replace(rig, **{name.replace("_off", ""): value for name, value in off.items() if value is not None})
+    simulator.simulate(out, simulator.SimulateParams(style, scale, fibers, seed, misalignment=rig), session.report)
     session.report.done(out)
 
 
@@ -359,13 +371,14 @@ def import_(
     show_default=True,
     help="The paper's own filter and growing, or ours, which finds more.",
 )
+@click.option("--calibration", type=PATH, help="What is wrong with the rig, from `strandscope calibrate`; it is corrected.")
 @click.option("--infill", type=click.IntRange(0), metavar="N", help="Number of hairs to add inside, where no camera sees.")
 @click.option("--no-infill", is_flag=True, help="Captured hairs only.")
 @click.option("--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given.")
 @click.option("--memory", type=Memory(), default="6GB", show_default=True, help="Memory to use at most; a capture that needs more is refused.")
 @common
 @click.pass_obj
-def reconstruct(session, capture, output, preset, params, method, infill, no_infill, workers, memory):
+def reconstruct(session, capture, output, preset, params, method, calibration, infill, no_infill, workers, memory):
     """Find the hairs in the photographs of CAPTURE and write them as curves to a strands file.
 
     CAPTURE is a folder with capture.json in it (`strandscope import` makes one from photographs). What a run needs to
@@ -384,9 +397,40 @@ def reconstruct(session, capture, output, preset, params, method, infill, no_inf
         parameters = replace(parameters, infill=None)
     elif infill is not None:
         parameters = replace(parameters, infill=replace(parameters.infill, count=infill))
-    strands = pipeline.reconstruct(capture, output, parameters, workers=workers, memory_bytes=memory, progress=session.report)
+    limits = {"workers": workers, "memory_bytes": memory, "progress": session.report}
+    strands = pipeline.reconstruct(capture, output, parameters, calibration=calibration, **limits)
     captured = len(strands.captured)
     session.report.show(f"{output}: {captured} captured curves, {len(strands) - captured} of infill")
+    session.report.done(output)
+
+
+@main_group.command(short_help="Find what is wrong with the rig, from a capture.")
+@click.argument("capture", type=PATH)
+@click.option("--from-features", is_flag=True, required=True, expose_value=False, help="From the hair itself: fibers must coincide across angles.")
+@click.option("-o", "--output", type=PATH, required=True, help="The calibration file to write (.json, .toml).")
+@click.option("--params", type=PATH, help="A TOML file with settings of the filter and of growing.")
+@click.option("--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given.")
+@click.option("--memory", type=Memory(), default="6GB", show_default=True, help="Memory to use at most; a capture that needs more is refused.")
+@common
+@click.pass_obj
+def calibrate(session, capture, output, params, workers, memory):
+    """Find by how much the rig that took CAPTURE is not as its capture.json says.
+
+    Looks for the place and the tilt of the turntable's axis, the focus, the working distance, the angle of each sweep, and the
+    gain of the photographs. Each is told with its standard error. Hand the file to `reconstruct --calibration`; the
+    capture itself is not changed.
+
+    \b
+    Example:
+      strandscope calibrate lock --from-features -o out/rig.json
+      strandscope reconstruct lock --calibration out/rig.json -o out/strands.npz
+    """
+    from . import pipeline
+    from .rig.calibrate import describe
+
+    parameters = pipeline.read_toml(params) if params else pipeline.preset()
+    found = pipeline.calibrate(capture, output, parameters, workers=workers, memory_bytes=memory, progress=session.report)
+    session.report.show(terminal.table(describe(found)))
     session.report.done(output)
 
 
@@ -404,9 +448,10 @@ def reconstruct(session, capture, output, preset, params, method, infill, no_inf
     show_default=True,
     help="Each curve in a colour of its own, or captured hairs and infill told apart.",
 )
+@click.option("--calibration", type=PATH, help="What is wrong with the rig, if the curves were made with it.")
 @common
 @click.pass_obj
-def overlay(session, capture, strands, output, sweep, angle, position, color):
+def overlay(session, capture, strands, output, sweep, angle, position, color, calibration):
     """Draw the curves of a strands file back onto a photograph of CAPTURE, to see whether they lie on the hairs.
 
     The picture shows the photograph, the ridges that were found in it, and the curves over the photograph. Only the parts of
@@ -423,6 +468,10 @@ def overlay(session, capture, strands, output, sweep, angle, position, color):
     if sweep is not None and angle is not None:
         raise click.UsageError("--sweep and --angle exclude each other")
     photographs, curves = load_capture(capture), load_strands(strands)
+    if calibration:
+        from .rig.calibrate import load_errors
+
+        photographs = load_errors(calibration).corrected(photographs)
     shot = compare.choose_shot(photographs, curves, sweep, angle, position)
     session.report.show(compare.overlay(photographs, curves, shot, output, color))
     session.report.done(output)

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from .capture import Capture
 from .errors import StrandscopeError, StrandsError
 from .files import atomic
-from .geometry import Optics, camera_points, project, to_pixel
+from .geometry import Optics, camera_points, pixels
 from .ridges import RidgeParams, estimate, response
 from .strands import INFILL, Strands, load_arrays, offsets_of
 
@@ -331,7 +331,7 @@ def choose_shot(
     half = depth_of_field_mm(capture.optics) / 2
     for k in range(len(capture.sweeps)) if sweep is None else [sweep]:
         positions = np.asarray(capture.sweeps[k].positions_mm)
-        depth = np.sort(_foremost(camera_points(strands.points_mm, capture.sweeps[k].angle_deg)))
+        depth = np.sort(_foremost(camera_points(strands.points_mm, capture.sweeps[k].angle_deg, capture.optics)))
         in_focus = np.searchsorted(depth, positions + half) - np.searchsorted(depth, positions - half)
         i = int(np.argmax(in_focus) if position_mm is None else np.argmin(np.abs(positions - position_mm)))
         if in_focus[i] > most:
@@ -352,9 +352,8 @@ def in_focus(capture: Capture, strands: Strands, shot: Shot) -> tuple[np.ndarray
     """Pixels (S, 2, 2) of the ends (column, row) of all segments within the depth of field, and their curves (S,)."""
     sweep = capture.sweeps[shot.sweep]
     d, optics = sweep.positions_mm[shot.photograph], capture.optics
-    u, v, w = camera_points(strands.points_mm, sweep.angle_deg).T
-    u, v = project(u, v, w, d, optics.working_distance_mm)
-    pixel = np.stack(to_pixel(u, v, optics.pitch_mm, optics.axis_col_px, optics.axis_row_px), axis=1)
+    *pixel, w = pixels(strands.points_mm, sweep.angle_deg, d, optics).T
+    pixel = np.stack(pixel, axis=1)
     curve = np.repeat(np.arange(len(strands)), np.diff(strands.offsets))
     sharp = np.abs(w - d) <= depth_of_field_mm(optics) / 2
     keep = sharp[:-1] & sharp[1:] & (curve[:-1] == curve[1:])

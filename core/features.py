@@ -7,7 +7,8 @@ the axes, because the camera looks along d; that is why each sweep has cells of 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,9 +16,11 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
+from .capture import Sweep
 from .errors import StrandscopeError
 from .files import atomic
-from .geometry import Optics, object_points, to_image, to_pixel, turn
+from .geometry import Optics, object_points, slope, tilt_back, tilt_of, to_image, to_pixel, turn
+from .ridges import Ridges
 
 STRIP_PX, BLOCK_PX = 32, 16  # columns and rows of a cell
 COL_STEPS, ROW_STEPS = 65536 // STRIP_PX, 65536 // BLOCK_PX  # units of the stored column and row, a pixel
@@ -80,16 +83,55 @@ def pack(angle_deg: float, positions_mm: Sequence[float], shape: tuple[int, int]
     )
 
 
+def pixels(features: SweepFeatures) -> tuple[np.ndarray, np.ndarray]:
+    """(column, row) of every feature, two arrays (n,) float64."""
+    cell = np.repeat(np.arange(len(features.cells) - 1) // len(features.positions_mm), np.diff(features.cells))
+    _, blocks = grid_shape(features.shape)
+    return (cell // blocks) * STRIP_PX + features.col / COL_STEPS, (cell % blocks) * BLOCK_PX + features.row / ROW_STEPS
+
+
 def unpack(features: SweepFeatures, optics: Optics) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(u, v, d) mm and the angle of the hair (rad) of every feature, four arrays (n,) float32."""
-    frames = len(features.positions_mm)
-    cell = np.repeat(np.arange(len(features.cells) - 1) // frames, np.diff(features.cells))
-    _, blocks = grid_shape(features.shape)
-    col = (cell // blocks) * STRIP_PX + features.col / COL_STEPS
-    row = (cell % blocks) * BLOCK_PX + features.row / ROW_STEPS
-    u, v = to_image(col, row, optics.pitch_mm, optics.axis_col_px, optics.axis_row_px)
+    u, v = to_image(*pixels(features), optics.pitch_mm, optics.axis_col_px, optics.axis_row_px)
     d = features.positions_mm[features.frame]
     return tuple(np.asarray(a, np.float32) for a in (u, v, d, features.angle * (np.pi / ANGLE_STEPS)))
+
+
+def upright(ridges: Ridges, focus_mm: float, optics: Optics, shape: tuple[int, int]) -> Ridges:
+    """The ridges of a photograph at d = focus_mm as they would be if the axis stood upright; those that leave it are dropped.
+
+    Features have their photograph's d, which a tilt towards the camera would change with their height. They are moved along
+    the line of sight instead, back to that d: what is left of the tilt is a shift in depth, 0.02 mm for 0.2 degrees 6 mm above
+    the middle, where a hair is in focus for 0.9 mm.
+    """
+    if optics.tilt_deg == 0 and optics.tilt_towards_deg == 0:
+        return ridges
+    view = (optics.pitch_mm, optics.axis_col_px, optics.axis_row_px)
+    u, v = to_image(np.asarray(ridges.col, float), np.asarray(ridges.row, float), *view)
+    u, v, d = tilt_back(u, v, focus_mm, *tilt_of(optics))
+    along_u, along_v, _ = slope(u, v, optics.working_distance_mm)
+    col, row = to_pixel(u + (focus_mm - d) * along_u, v + (focus_mm - d) * along_v, *view)
+    inside = (col >= 0) & (col <= shape[1] - 1) & (row >= 0) & (row <= shape[0] - 1)
+    angle = (ridges.angle + np.radians(optics.tilt_deg)) % np.pi  # a hair along the axis becomes upright
+    return Ridges(*(np.asarray(a, np.float32)[inside] for a in (col, row, angle, ridges.strength)))
+
+
+def seen_by(features: SweepFeatures, sweep: Sweep, optics: Optics) -> SweepFeatures:
+    """Features that were stored as the photographs show them, for a rig whose angle, positions and tilt are known better.
+
+    sweep.positions_mm are those of the photographs in the order of the capture, as when the features were stored.
+    """
+    positions = np.sort(np.asarray(sweep.positions_mm, np.float64))
+    if optics.tilt_deg == 0 and optics.tilt_towards_deg == 0:
+        return replace(features, angle_deg=sweep.angle_deg, positions_mm=positions)
+    col, row = pixels(features)
+    angle = features.angle * (np.pi / ANGLE_STEPS)
+    strength = STRENGTH_LEAST * np.exp(features.strength / STRENGTH_STEPS)
+    order = np.argsort(features.frame, kind="stable")
+    ends = np.searchsorted(features.frame[order], np.arange(len(positions) + 1))
+    frames = (order[a:b] for a, b in pairwise(ends))
+    found = [upright(Ridges(col[i], row[i], angle[i], strength[i]), d, optics, features.shape) for i, d in zip(frames, positions, strict=True)]
+    return pack(sweep.angle_deg, positions, features.shape, found)
 
 
 # ---- one file a sweep ------------------------------------------------------------------------------------------------

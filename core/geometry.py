@@ -24,6 +24,8 @@ class Optics:
     axis_col_px: float  # column of the rotation axis, pixel centres at integers
     axis_row_px: float  # row where the optical axis meets the image
     aperture_cone_deg: float  # full angle of the cone of rays that meet in a point of the plane of focus
+    tilt_deg: float = 0.0  # how far the upper end of the rotation axis leans to the right in the image
+    tilt_towards_deg: float = 0.0  # and how far towards the camera
 
 
 # ---- single coordinates: floats or arrays, also compiled into kernels ------------------------------------------------
@@ -37,6 +39,19 @@ def turn(x, y, z, cos_theta, sin_theta):
 def turn_back(u, v, w, cos_theta, sin_theta):
     """Camera frame (u', v', w) -> object frame (x, y, z), the inverse of ``turn``. mm."""
     return u * cos_theta - w * sin_theta, v, u * sin_theta + w * cos_theta
+
+
+def tilt(u, v, w, cos_right, sin_right, cos_towards, sin_towards):
+    """Frame of the rotation axis -> camera frame, where the axis leans: its upper end towards the camera, then to the right.
+    Both turns are about the point where the optical axis meets the rotation axis. mm."""
+    v, w = v * cos_towards - w * sin_towards, w * cos_towards + v * sin_towards
+    return u * cos_right + v * sin_right, v * cos_right - u * sin_right, w
+
+
+def tilt_back(u, v, w, cos_right, sin_right, cos_towards, sin_towards):
+    """Camera frame -> frame of the rotation axis, the inverse of ``tilt``. mm."""
+    u, v = u * cos_right - v * sin_right, v * cos_right + u * sin_right
+    return u, v * cos_towards + w * sin_towards, w * cos_towards - v * sin_towards
 
 
 def project(u, v, w, focus_mm, working_distance_mm):
@@ -63,10 +78,20 @@ def to_image(col, row, pitch_mm, axis_col_px, axis_row_px):
 # ---- whole arrays ----------------------------------------------------------------------------------------------------
 
 
-def camera_points(points_mm, angle_deg):
-    """points_mm (..., 3) of the object frame -> (..., 3) of the camera frame at a turntable angle, mm."""
+def camera_points(points_mm, angle_deg, optics=None):
+    """points_mm (..., 3) of the object frame -> (..., 3) of the camera frame at a turntable angle, mm.
+
+    Without ``optics`` the axis stands upright; with them it leans as they say.
+    """
     theta = np.radians(angle_deg)
-    return np.stack(turn(*np.moveaxis(np.asarray(points_mm), -1, 0), np.cos(theta), np.sin(theta)), axis=-1)
+    turned = turn(*np.moveaxis(np.asarray(points_mm), -1, 0), np.cos(theta), np.sin(theta))
+    return np.stack(tilt(*turned, *tilt_of(optics)) if optics is not None else turned, axis=-1)
+
+
+def tilt_of(optics):
+    """(cos, sin) of the tilt to the right and (cos, sin) of the tilt towards the camera, as ``tilt`` takes them."""
+    right, towards = np.radians([optics.tilt_deg, optics.tilt_towards_deg])
+    return np.cos(right), np.sin(right), np.cos(towards), np.sin(towards)
 
 
 def object_points(points_mm, angle_deg):
@@ -77,6 +102,6 @@ def object_points(points_mm, angle_deg):
 
 def pixels(points_mm, angle_deg, focus_mm, optics):
     """Where points (..., 3) mm of the object frame appear in a photograph: (..., 3) of column, row (px) and w (mm)."""
-    u, v, w = np.moveaxis(camera_points(points_mm, angle_deg), -1, 0)
+    u, v, w = np.moveaxis(camera_points(points_mm, angle_deg, optics), -1, 0)
     u, v = project(u, v, w, focus_mm, optics.working_distance_mm)
     return np.stack([*to_pixel(u, v, optics.pitch_mm, optics.axis_col_px, optics.axis_row_px), w], axis=-1)

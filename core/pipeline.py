@@ -19,13 +19,31 @@ import numpy as np
 
 from .capture import Capture, load_capture
 from .errors import CaptureError, StrandscopeError
-from .features import SweepFeatures, build_index, load_features, pack, save_features, unpack
+from .features import SweepFeatures, build_index, load_features, pack, save_features, seen_by, unpack, upright
 from .files import atomic
+from .geometry import Optics
 from .grow import PAPER, Grown, GrowParams, grow
 from .hull import Grid, HullParams, blueness, carve, grid_of, occupancy, visual_hull
 from .infill import InfillParams, infill
+from .match import Reach, sides_of, sightings
 from .progress import Progress, silent
 from .ridges import RidgeParams, Ridges, detect, estimate
+from .rig.calibrate import (
+    ANGLE_FLOOR_DEG,
+    FIRST_SWEEP,
+    SURE,
+    TUKEY,
+    Calibration,
+    RigErrors,
+    Solution,
+    drift,
+    gains,
+    light,
+    load_errors,
+    save_calibration,
+    solve,
+    turns,
+)
 from .strands import CAPTURED, INFILL, Strands, concatenate, save_strands
 
 VERSION = "0.1.0"
@@ -61,14 +79,25 @@ def preset(name: str = "auto", method: str = "strandscope") -> Parameters:
 
 
 def reconstruct(
-    capture_path: Path, out: Path, parameters: Parameters, *, workers: int = 1, memory_bytes: int = 6 * 10**9, progress: Progress = silent
+    capture_path: Path,
+    out: Path,
+    parameters: Parameters,
+    *,
+    calibration: Path | None = None,
+    workers: int = 1,
+    memory_bytes: int = 6 * 10**9,
+    progress: Progress = silent,
 ) -> Strands:
     """Reconstruct a capture and write its strands to ``out`` (.npz); returns them.
+
+    The errors of the rig that a ``calibration`` file tells are corrected.
 
     The same capture and parameters give the same bytes for any number of workers. Raises CaptureError for a capture that
     cannot be read, StrandscopeError where nothing was found or written, or more than ``memory_bytes`` would be needed.
     """
     capture = load_capture(capture_path)
+    if calibration is not None:
+        capture = load_errors(calibration).corrected(capture)
     parameters = resolve(capture, parameters)
     work = work_folder(capture, Path(out), parameters)
     sweeps = find_features(capture, work, parameters, workers, progress)
@@ -91,35 +120,37 @@ def reconstruct(
 
 def find_features(capture: Capture, work: Path, parameters: Parameters, workers: int, progress: Progress) -> list[SweepFeatures]:
     """The features of every sweep, filtered from the photographs unless ``work`` has them from a run before."""
-    missing = [i for i in range(len(capture.sweeps)) if not (_features_path(work, i).is_file() and _blueness_path(work, i).is_file())]
+    missing = [i for i in range(len(capture.sweeps)) if not all(path(work, i).is_file() for path in _PRODUCTS)]
     shape, total = capture.shape, sum(len(capture.sweeps[i].files) for i in missing)
     jobs = [(capture, file, parameters, shape) for i in missing for file in capture.sweeps[i].files]
     done = 0
     with _processes(workers) as run:
         results = run(_filter, jobs)
         for i in missing:
-            sweep, ridges, blues = capture.sweeps[i], [], []
-            for _ in sweep.files:
+            sweep, ridges, blues, lights = capture.sweeps[i], [], [], []
+            for d in sweep.positions_mm:
                 progress("finding ridges", done, total)
-                found, blue = next(results)
-                ridges.append(found)
+                found, blue, lit = next(results)
+                ridges.append(upright(found, d, capture.optics, shape))
                 blues.append(blue)
+                lights.append(lit)
                 done += 1
-            with atomic(_blueness_path(work, i)) as part:
-                np.save(part, np.stack(blues))
+            for path, pictures in ((_blueness_path, blues), (_light_path, lights)):
+                with atomic(path(work, i)) as part:
+                    np.save(part, np.stack(pictures))
             save_features(_features_path(work, i), pack(sweep.angle_deg, sweep.positions_mm, shape, ridges))
     progress("finding ridges", total, total)
     return [load_features(_features_path(work, i)) for i in range(len(capture.sweeps))]
 
 
-def _filter(job: tuple[Capture, str, Parameters, tuple[int, int]]) -> tuple[Ridges, np.ndarray]:
-    """One photograph: its ridges on the red plane, and its picture of blueness."""
+def _filter(job: tuple[Capture, str, Parameters, tuple[int, int]]) -> tuple[Ridges, np.ndarray, np.ndarray]:
+    """One photograph: its ridges on the red plane, its picture of blueness and its picture of light."""
     capture, file, parameters, shape = job
     planes = capture.planes(file, "RGB")
     if planes.shape[1:] != shape:
         found, first = (f"{2 * s[1]} x {2 * s[0]}" for s in (planes.shape[1:], shape))
         raise CaptureError(f"{capture.folder / file}: the photograph has {found} pixels; expected {first}, as {capture.sweeps[0].files[0]}")
-    return detect(planes[0], parameters.ridges), blueness(planes, parameters.hull)
+    return detect(planes[0], parameters.ridges), blueness(planes, parameters.hull), light(planes)
 
 
 @contextmanager
@@ -161,6 +192,13 @@ def _blueness_path(work: Path, i: int) -> Path:
     return work / f"sweep_{i:03d}.blueness.npy"
 
 
+def _light_path(work: Path, i: int) -> Path:
+    return work / f"sweep_{i:03d}.light.npy"
+
+
+_PRODUCTS = (_features_path, _blueness_path, _light_path)  # of the filter, a file each for every sweep
+
+
 def resolve(capture: Capture, parameters: Parameters) -> Parameters:
     """Fill in what the parameters leave to be estimated from the photographs."""
     if parameters.ridges.offset is not None:
@@ -182,7 +220,7 @@ def work_folder(capture: Capture, out: Path, parameters: Parameters) -> Path:
     return work
 
 
-def has_work_folder(capture: Capture, out: Path, parameters: Parameters) -> bool:
+def haswork_folder(capture: Capture, out: Path, parameters: Parameters) -> bool:
     """Whether a run of this capture with these parameters of the filter left its folder beside ``out``."""
     stamp = _work_path(out) / STAMP
     return stamp.is_file() and stamp.read_text() == _made_from(capture, parameters)
@@ -204,6 +242,134 @@ def _made_from(capture: Capture, parameters: Parameters) -> str:
         "hull": [parameters.hull.block_px, parameters.hull.dark],
     }
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+# ---- features -> what is wrong with the rig --------------------------------------------------------------------------
+
+SPACING_MM, MOST_POINTS = 0.3, 12_000  # of points on curves that the rig is told from
+CHORD_MM = 0.4  # half of what a direction is measured over
+# pixels that a sweep's observations may lie off a curve, in each round, and the rounds that grow the curves anew
+ROUNDS_PX = (6.0, 4.0, 3.0, 2.0, 1.5, 1.5, 1.5, 1.5)
+GROWN_IN = (0, 2, 4)
+LEAST_DRIFT = 0.003  # parts of the light, below which a drift is not corrected
+BIAS_LEFT = 0.2  # share of what the biases of depth from focus explain that may be explained wrongly
+# what is not explained by either, found on simulated locks with known rigs
+FLOOR = RigErrors(axis_px=0.003, tilt_deg=0.001, tilt_towards_deg=0.005, focus_mm=0.004)
+FLOOR_SCALE = 0.0003
+TUKEY_FAR = 2.5  # in rounds where curves may lie far off: many observations are then those of other hairs
+REGROW_PX = 0.25  # that the rig moved the hair since the curves were grown
+SETTLED = 0.1  # a round that changes nothing by more than this many standard errors is the last
+
+
+def calibrate(
+    capture_path: Path, out: Path, parameters: Parameters, *, workers: int = 1, memory_bytes: int = 6 * 10**9, progress: Progress = silent
+) -> Calibration:
+    """Find the errors of the rig that took a capture from the capture itself, write them to ``out`` (.json, .toml); returns them.
+
+    The photographs are filtered once; then curves are grown with the rig as known so far, the rig is solved for, and so on
+    until it stays. Raises CaptureError, StrandscopeError as ``reconstruct`` does, and where too few fibers are seen.
+    """
+    capture = load_capture(capture_path)
+    parameters = resolve(capture, parameters)
+    stated = replace(capture, optics=replace(capture.optics, tilt_deg=0.0, tilt_towards_deg=0.0))
+    work = work_folder(stated, Path(out), parameters)
+    sweeps = find_features(stated, work, parameters, workers, progress)
+    _check_memory(sweeps, 2 * memory_bytes // 3)  # some are turned and joined anew in each round
+    errors, solution, biased = _solved(capture, sweeps, parameters, workers, progress)
+    told = [gains(np.load(_light_path(work, i))) for i in range(len(sweeps))]
+    calibration = _summed_up(capture, errors, solution, biased, told)
+    save_calibration(out, calibration)
+    return calibration
+
+
+def _solved(
+    capture: Capture, sweeps: list[SweepFeatures], parameters: Parameters, workers: int, progress: Progress
+) -> tuple[RigErrors, Solution, np.ndarray]:
+    """The errors of the rig by which the sweeps' features agree best, the last step towards them, and how far off each of its
+    unknowns may be because the biases of depth from focus are not wholly those that the equations have."""
+    errors, moved_px = RigErrors(), np.inf
+    for number, reach_px in enumerate(ROUNDS_PX):
+
+        def growing(_stage, done, total, number=number):
+            progress("calibrating", number + 0.9 * done / total, len(ROUNDS_PX))
+
+        growing("", 0, 1)
+        rig = errors.corrected(capture)
+        index = build_index([seen_by(f, s, rig.optics) for f, s in zip(sweeps, rig.sweeps, strict=True)], rig.optics)
+        if number in GROWN_IN and moved_px > REGROW_PX:
+            moved_px = 0.0
+            points, tangents, bends = _on_curves(grow(index, parameters.grow, workers, growing))
+        found = sightings(index, points, tangents, bends, _reach(reach_px, rig.optics, parameters), np.radians(rig.optics.tilt_towards_deg))
+        last = reach_px == ROUNDS_PX[-1]
+        solution = solve(found, len(sweeps), tukey=TUKEY if last else TUKEY_FAR)
+        errors = errors.plus(solution.change, capture)
+        half = np.array([1, 0.5 * index.rows * index.pitch, *[0.5 * index.columns * index.pitch] * len(sweeps)])  # mm: of the picture
+        moved_px += np.abs(solution.change[[0, 1, *range(FIRST_SWEEP, len(solution.change))]] * half).max() / index.pitch
+        moves = np.clip(solution.moves, -2 * reach_px * index.pitch, 2 * reach_px * index.pitch)
+        points[solution.points] += np.einsum("ps,psi->pi", moves, sides_of(tangents[solution.points]))
+        spread = np.sqrt(np.diag(solution.covariance))
+        if last and np.all(np.abs(solution.change) <= SETTLED * spread):
+            break
+    progress("calibrating", len(ROUNDS_PX), len(ROUNDS_PX))
+    unbiased = solve(found, len(sweeps), biased=False)
+    return errors, solution, BIAS_LEFT * np.abs(unbiased.change - solution.change)
+
+
+def _reach(across_px: float, optics: Optics, parameters: Parameters) -> Reach:
+    """Which observations tell of a point of a curve, when curves may lie ``across_px`` off."""
+    focus_mm = parameters.grow.radius_mm / np.tan(np.radians(optics.aperture_cone_deg) / 2)  # where the blur is as wide as a hair
+    far = across_px > ROUNDS_PX[-1]
+    return Reach(
+        along_mm=0.2,
+        across_mm=ROUNDS_PX[-1] * optics.pitch_mm,
+        depth_mm=0.65 * focus_mm,
+        first_across_mm=across_px * optics.pitch_mm,
+        first_depth_mm=(1.3 if far else 0.65) * focus_mm,
+        angle=float(np.radians(8.0)),
+        least=8,
+    )
+
+
+def _on_curves(grown: Grown) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (n, 3) mm on grown curves, evenly chosen, the unit tangents there, and the vectors of curvature (1/mm)."""
+    points, offsets = grown.points_mm.astype(np.float64), grown.offsets
+    if len(points) < 2:
+        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3))
+    step_mm = float(np.median(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    half = max(round(CHORD_MM / step_mm), 1)
+    first, last = (np.repeat(ends, np.diff(offsets)) for ends in (offsets[:-1], offsets[1:] - 1))
+    i = np.arange(len(points))
+    inner = np.flatnonzero((i - first >= half) & (last - i >= half))  # ends of curves are the least sure
+    stride = max(round(SPACING_MM / step_mm), -(-len(inner) // MOST_POINTS), 1)
+    inner = inner[::stride]
+    chord = points[inner + half] - points[inner - half]
+    bends = (points[inner + half] + points[inner - half] - 2 * points[inner]) / (half * step_mm) ** 2
+    return points[inner], chord / np.linalg.norm(chord, axis=1, keepdims=True), bends
+
+
+def _summed_up(capture: Capture, errors: RigErrors, solution: Solution, biased: np.ndarray, told: list[tuple[np.ndarray, float]]) -> Calibration:
+    """What was found, with uncertainties. The sweeps before the first step that slipped are right on average."""
+    covariance = np.degrees(np.degrees(solution.covariance[FIRST_SWEEP:, FIRST_SWEEP:]))
+    angles = np.array(errors.angles_deg)
+    every, slips = turns(angles, covariance)
+    right = slice(0, slips[0].sweep if slips else len(angles)) if every[0] == 0 else slice(0, 1)
+    spread = np.hypot(np.sqrt(np.diag(solution.covariance)), biased)
+    drifts = tuple((drift(gain), error) for gain, error in told)
+    sure = any(np.isfinite(error) and abs(value) > max(SURE * error, LEAST_DRIFT) for value, error in drifts)
+    known = RigErrors(
+        axis_px=float(np.hypot(spread[0] / capture.optics.pitch_mm, FLOOR.axis_px)),
+        tilt_deg=float(np.hypot(np.degrees(spread[1]), FLOOR.tilt_deg)),
+        tilt_towards_deg=float(np.hypot(np.degrees(spread[2]), FLOOR.tilt_towards_deg)),
+        focus_mm=float(np.hypot(spread[3], FLOOR.focus_mm)),
+        working_distance_mm=float(capture.optics.working_distance_mm * np.hypot(spread[4], FLOOR_SCALE)),
+        angles_deg=tuple(float(np.hypot(a, ANGLE_FLOOR_DEG)) for a in np.sqrt(np.diag(covariance))),
+    )
+    errors = replace(
+        errors,
+        angles_deg=tuple(float(a) for a in angles - angles[right].mean()),
+        gains=tuple(tuple(float(g) for g in gain) for gain, _ in told) if sure else (),
+    )
+    return Calibration(capture.name, errors, known, every, tuple(slips), drifts, solution.across_mm, solution.depth_mm, len(solution.points))
 
 
 # ---- fibers -> strands -----------------------------------------------------------------------------------------------

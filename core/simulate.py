@@ -26,6 +26,7 @@ from .geometry import Optics
 from .groom import STYLES, Groom, GroomParams, curvature, groom
 from .progress import Progress, silent
 from .raw import write_dng
+from .rig.calibrate import RigErrors
 
 BLACK, WHITE = 512, 15871  # of the sensor, 14 bit
 JOURNAL = "simulation.json"  # what was asked for, to know whether a run can be continued
@@ -59,6 +60,33 @@ SCALES = {
 
 
 @dataclass(frozen=True)
+class Misalignment:
+    """What is wrong with the rig that takes the photographs; capture.json keeps what its owner believes. Meaning and signs are
+    those of ``RigErrors``."""
+
+    axis_px: float = 0.0
+    tilt_deg: float = 0.0
+    tilt_towards_deg: float = 0.0
+    focus_mm: float = 0.0
+    working_distance_mm: float = 0.0
+    turntable_step_deg: float = 0.0  # the step in the middle turns this much too far, once: all later sweeps are off
+    every_step_deg: float = 0.0  # every step turns this much too far
+    gain_drift: float = 0.0  # in each sweep the photographs gain this much light from the first to the last, in parts
+
+    def errors(self, capture: Capture) -> RigErrors:
+        """The same for the sweeps of a capture."""
+        k = np.arange(len(capture.sweeps))
+        angles = self.every_step_deg * k + self.turntable_step_deg * (k >= len(k) // 2)
+        gains = tuple(tuple(1 + self.gain_drift * np.linspace(-0.5, 0.5, len(sweep.files))) for sweep in capture.sweeps)
+        rig = (self.axis_px, self.tilt_deg, self.tilt_towards_deg, self.focus_mm, self.working_distance_mm)
+        return RigErrors(*rig, tuple(float(a) for a in angles), gains)
+
+
+# A rig that was set up with care and never checked.
+MISALIGNED = Misalignment(3.0, 0.2, 0.2, 0.2, 2.0, 0.1, 0.0, 0.05)
+
+
+@dataclass(frozen=True)
 class SimulateParams:
     """What to simulate. The optics are those of sec. 3; the same parameters give the same bytes."""
 
@@ -75,6 +103,7 @@ class SimulateParams:
     exposure: float = 0.75  # of white: what the brightest hundredth of the hair reaches in red
     open_f_number: float = 2.8  # the f-number at which the aperture has the cone above
     turntable_f_number: float = 16.0
+    misalignment: Misalignment = Misalignment()
 
 
 @dataclass(frozen=True)
@@ -315,11 +344,12 @@ class Drawing:
     span_mm: np.ndarray  # (2,) float32: all that is seen is in between, in w
 
 
-def drawing(hair: Hair, angle_deg: float, shaded: Shade | None = None) -> Drawing:
-    """The hair turned by an angle, ready to be drawn; without ``shaded`` it is black. Raises StrandscopeError for too much hair."""
+def drawing(hair: Hair, angle_deg: float, shaded: Shade | None = None, optics: Optics | None = None) -> Drawing:
+    """The hair turned by an angle, ready to be drawn; without ``shaded`` it is black, without ``optics`` the axis is upright.
+    Raises StrandscopeError for too much hair."""
     if len(hair.segments) > _MOST:
         raise StrandscopeError(f"the hair has {len(hair.segments)} straight pieces; expected {_MOST} at most: fewer or shorter fibers")
-    where = geometry.camera_points(hair.points_mm, angle_deg)
+    where = geometry.camera_points(hair.points_mm, angle_deg, optics)
     order = hair.segments[np.argsort(-where[hair.segments, 1], kind="stable")]
     ends = np.column_stack([where[order], where[order + 1], hair.radius_mm[order]]).astype(np.float32)
     colors = np.zeros((len(order), 7), np.float32)
@@ -533,11 +563,11 @@ def visibility(hair: Hair, at: Samples, optics: Optics, angle_deg: float, rays: 
     For each slab of depths the hair is drawn from points of the lens at twice the resolution of the photographs, which
     tells what stands before each sample. A fiber hides itself only where it comes back in front, as a curl does.
     """
-    where = geometry.camera_points(at.points_mm, angle_deg)
+    where = geometry.camera_points(at.points_mm, angle_deg, optics)
     seen = np.zeros(len(where))
     if not len(where):
         return seen
-    drawn = drawing(hair, angle_deg)
+    drawn = drawing(hair, angle_deg, optics=optics)
     pitch = optics.pitch_mm / 2
     slab = np.floor(where[:, 2] / slab_mm)
     for level in np.unique(slab):
@@ -612,15 +642,15 @@ def simulate(out: Path, params: SimulateParams, progress: Progress = silent, wor
     capture = plan(out, params)
     if _begin(out, params):
         return load_capture(out)
-    scale = SCALES[params.scale]
     progress("groom", 0, 1)
     lock = groom(lock_params(params), np.random.default_rng([params.seed, 0]))
     progress("groom", 1, 1)
     hair = prepare(lock, np.random.default_rng([params.seed, 1]))
     with ThreadPoolExecutor((workers or os.cpu_count()) + 1) as pool:  # one more, since writing waits for the disk
-        _photographs(capture, hair, params, progress, pool)
+        rig = params.misalignment.errors(capture).corrected(capture)
+        _photographs(rig, hair, params, progress, pool)
         if not capture.truth_path.is_file():
-            _write_truth(capture, lock, hair, scale, progress, pool)
+            _write_truth(rig, lock, hair, params, progress, pool)
     save_capture(replace(capture, unknown={"simulation": asdict(params)}))
     return load_capture(out)
 
@@ -668,11 +698,13 @@ def _photographs(capture: Capture, hair: Hair, params: SimulateParams, progress:
     gain = _gain(hair, fog, look, params)
     reach = float(np.percentile(np.hypot(hair.points_mm[:, 0], hair.points_mm[:, 2]), 99))  # few fibers fly off farther
     stopped = replace(optics, aperture_cone_deg=stopped_cone_deg(params))
-    sequences = [(s.angle_deg, d, f, optics) for s in capture.sweeps for d, f in zip(s.positions_mm, s.files, strict=True)]
-    sequences += [(a, capture.turntable.focus_mm, f, stopped) for a, f in zip(capture.turntable.angles_deg, capture.turntable.files, strict=True)]
+    sequences = [(s.angle_deg, d, f, optics, g) for s in capture.sweeps for d, f, g in zip(s.positions_mm, s.files, s.gains, strict=True)]
+    sequences += [
+        (a, capture.turntable.focus_mm, f, stopped, 1.0) for a, f in zip(capture.turntable.angles_deg, capture.turntable.files, strict=True)
+    ]
     by_angle: dict[float, list] = {}
-    for number, (angle, focus, file, through) in enumerate(sequences):
-        by_angle.setdefault(angle, []).append((number, focus, file, through))
+    for number, (angle, *shot) in enumerate(sequences):
+        by_angle.setdefault(angle, []).append((number, *shot))
     done = 0
     for angle, shots in by_angle.items():
         missing = [shot for shot in shots if not (capture.folder / shot[2]).is_file()]
@@ -680,14 +712,14 @@ def _photographs(capture: Capture, hair: Hair, params: SimulateParams, progress:
         if not missing:
             continue
         shaded = shade(hair, fog, look, angle, optics.working_distance_mm)
-        drawn = drawing(hair, angle, replace(shaded, color=shaded.color * np.float32(gain)))
+        drawn = drawing(hair, angle, replace(shaded, color=shaded.color * np.float32(gain)), optics)
 
         def take(shot, drawn=drawn):
-            number, focus, file, through = shot
+            number, focus, file, through, brighter = shot
             rng = np.random.default_rng([params.seed, 2, number])
             disc = lens(lens_count(through, reach + abs(focus)), aperture_radius_mm(through), scale.rows + 1, rng)
             planes = photograph(drawn, background, through, focus, disc)
-            write_dng(capture.folder / file, expose(planes, params.full_well_e, params.read_noise_e, rng), BLACK, WHITE)
+            write_dng(capture.folder / file, expose(planes * np.float32(brighter), params.full_well_e, params.read_noise_e, rng), BLACK, WHITE)
 
         for _ in _each(pool, take, missing):
             done += 1
@@ -717,9 +749,9 @@ def _gain(hair: Hair, fog: Density, look: Look, params: SimulateParams) -> float
     return params.exposure / float(np.percentile(np.concatenate(shades), 99))
 
 
-def _write_truth(capture: Capture, lock: Groom, hair: Hair, scale: Scale, progress: Progress, pool: ThreadPoolExecutor) -> None:
+def _write_truth(capture: Capture, lock: Groom, hair: Hair, params: SimulateParams, progress: Progress, pool: ThreadPoolExecutor) -> None:
     """truth.npz: the fibers, samples of them inside the captured volume, and how much of the aperture sees each."""
-    pitch, margin = capture.optics.pitch_mm, 0.1
+    scale, pitch, margin = SCALES[params.scale], params.pitch_mm, 0.1
     radius = min((scale.columns - 1) / 2 * pitch, scale.half_range_mm) - margin
     at = samples(lock, radius, (scale.rows - 1) / 2 * pitch - margin)
     seen = np.zeros((len(at.points_mm), len(capture.sweeps)), np.float16)

@@ -55,6 +55,25 @@ def test_what_is_saved_is_loaded(tmp_path, positions):
     assert loaded.sweeps[0].files == files
 
 
+def test_a_gain_is_kept_and_taken_out_of_the_photograph(noise_capture):
+    head = json.loads((noise_capture / "capture.json").read_text())
+    head["sweeps"][1]["gains"] = [1.0, 1.1, 0.8, 1.0, 1.0]
+    plain = load_capture(noise_capture)
+    (noise_capture / "capture.json").write_text(json.dumps(head))
+    capture = load_capture(noise_capture)
+    assert capture.sweeps[1].gains == (1.0, 1.1, 0.8, 1.0, 1.0)
+    for sweep, gain in ((1, 0.8), (0, 1.0)):
+        file = capture.sweeps[sweep].files[2]
+        np.testing.assert_allclose(capture.planes(file) * gain, plain.planes(file), rtol=1e-6)
+    save_capture(capture)
+    assert load_capture(noise_capture).sweeps == capture.sweeps
+    for wrong, told in (([1.0], "1 numbers"), ([1, 1, 0, 1, 1], "more than 0")):
+        head["sweeps"][1]["gains"] = wrong
+        (noise_capture / "capture.json").write_text(json.dumps(head))
+        with pytest.raises(CaptureError, match=told):
+            load_capture(noise_capture)
+
+
 def test_it_is_found_by_folder_and_by_file(noise_capture):
     by_folder, by_file = load_capture(noise_capture), load_capture(noise_capture / "capture.json")
     assert by_folder.sweeps == by_file.sweeps

@@ -1,13 +1,15 @@
 """The store against its own definition: what goes in comes out within the quantisation, and a box holds what lies in it."""
 
 import mmap
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from strandscope.core.capture import Sweep
 from strandscope.core.errors import StrandscopeError
-from strandscope.core.features import USED, KdTree, box_query, build_index, grid_shape, load_features, pack, save_features, unpack
-from strandscope.core.geometry import Optics
+from strandscope.core.features import USED, KdTree, box_query, build_index, grid_shape, load_features, pack, save_features, seen_by, unpack, upright
+from strandscope.core.geometry import Optics, pixels
 from strandscope.core.ridges import Ridges
 
 from .known import OPTICS, SHAPE, turn_between
@@ -28,6 +30,50 @@ def some_sweep(angle_deg=0.0, positions_mm=IRREGULAR_MM, each=120, seed=0, shape
 
 def same_arrays(a, b):
     return all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ("positions_mm", "cells", "col", "row", "frame", "angle", "strength"))
+
+
+# ---- an axis that leans ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tilt", [{"tilt_deg": 0.3}, {"tilt_towards_deg": 0.3}, {"tilt_deg": -0.2, "tilt_towards_deg": 0.2}])
+def test_ridges_set_upright_are_where_an_upright_axis_has_them(tilt):
+    """Points around the plane of focus of a rig that leans, seen through the lens; the same points, seen by an upright rig."""
+    rng = np.random.default_rng(0)
+    points, d = rng.uniform((-1.8, -2.8, 0.3), (1.8, 2.8, 0.7), (200, 3)), 0.5
+    along = points + rng.normal(0, (0.02, 0, 0.02), (200, 3)) + (0, 0.1, 0)
+    leaning = replace(OPTICS, **tilt)
+
+    def seen(optics):
+        (col, row, _), (there, above, _) = pixels(points, 0, d, optics).T, pixels(along, 0, d, optics).T
+        return Ridges(col, row, np.arctan2(row - above, there - col) % np.pi, np.ones(200))
+
+    found, wanted = upright(seen(leaning), d, leaning, SHAPE), seen(OPTICS)
+    assert len(found.col) == 200
+    # a tilt towards the camera is known at the plane of focus; 0.2 mm from it v is off by 0.2 mm times 0.3 degrees, 0.04 px
+    np.testing.assert_allclose(found.col, wanted.col, atol=0.01)
+    np.testing.assert_allclose(found.row, wanted.row, atol=0.05)
+    assert np.degrees(np.abs(turn_between(found.angle, wanted.angle))).max() < 0.15
+
+
+def test_ridges_that_leave_the_photograph_are_dropped():
+    ridges = Ridges(*(np.float32(a) for a in ([149, 75], [0, 0], [1, 1], [1, 1])))
+    kept = upright(ridges, 0.0, replace(OPTICS, tilt_deg=-2), SHAPE)  # the top of the picture moves to the right
+    assert len(kept.col) == 1
+
+
+def test_features_for_a_rig_known_better_are_those_of_its_ridges():
+    sweep, ridges = some_sweep(30.0)
+    optics = replace(OPTICS, tilt_deg=0.2, tilt_towards_deg=-0.2)
+    better = Sweep(30.1, tuple(d + 0.1 for d in IRREGULAR_MM), tuple("abcdefg"))
+    anew = pack(30.1, better.positions_mm, SHAPE, [upright(r, d, optics, SHAPE) for r, d in zip(ridges, better.positions_mm, strict=True)])
+    found = seen_by(sweep, better, optics)
+    assert found.angle_deg == 30.1
+    assert abs(len(found) - len(anew)) <= 2  # at the rim, by the quantisation
+    for told, wanted in zip(unpack(found, OPTICS), unpack(anew, OPTICS), strict=True):
+        assert np.quantile(told, [0.1, 0.5, 0.9]) == pytest.approx(np.quantile(wanted, [0.1, 0.5, 0.9]), abs=2e-2)
+    upright_rig = seen_by(sweep, better, OPTICS)
+    assert upright_rig.col is sweep.col
+    assert upright_rig.positions_mm == pytest.approx(better.positions_mm)
 
 
 # ---- packing ---------------------------------------------------------------------------------------------------------

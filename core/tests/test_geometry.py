@@ -1,5 +1,7 @@
 """Axes and signs, against numbers worked out by hand and against the laws they must obey."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +9,7 @@ from hypothesis import strategies as st
 from numba import njit
 
 from strandscope.core import geometry
-from strandscope.core.geometry import Optics, camera_points, object_points, pixels, project, slope, to_image, to_pixel
+from strandscope.core.geometry import Optics, camera_points, object_points, pixels, project, slope, tilt, tilt_back, tilt_of, to_image, to_pixel
 
 MM = st.floats(-40, 40)
 OPTICS = Optics(working_distance_mm=330.0, pitch_mm=1 / 35, axis_col_px=1096.5, axis_row_px=731.0, aperture_cone_deg=10.0)
@@ -32,6 +34,36 @@ def test_turning_back_undoes_turning_and_keeps_lengths(point, angle_deg):
     turned = camera_points(point, angle_deg)
     np.testing.assert_allclose(object_points(turned, angle_deg), point, atol=1e-9)
     assert np.linalg.norm(turned) == pytest.approx(np.linalg.norm(point), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("point", "expected"),
+    [
+        ((0, 10, 0), (10 * np.sin(0.02), 10 * np.cos(0.02), 0)),  # the upper end of the axis leans to the right
+        ((3, 0, 0), (3 * np.cos(0.02), -3 * np.sin(0.02), 0)),
+        ((0, 0, 5), (0, 0, 5)),
+    ],
+)
+def test_an_axis_may_lean_to_the_right(point, expected):
+    np.testing.assert_allclose(camera_points(point, 0, replace(OPTICS, tilt_deg=np.degrees(0.02))), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("point", "expected"),
+    [
+        ((0, 10, 0), (0, 10 * np.cos(0.02), 10 * np.sin(0.02))),  # the upper end of the axis leans towards the camera
+        ((0, 0, 5), (0, -5 * np.sin(0.02), 5 * np.cos(0.02))),
+        ((3, 0, 0), (3, 0, 0)),
+    ],
+)
+def test_an_axis_may_lean_towards_the_camera(point, expected):
+    np.testing.assert_allclose(camera_points(point, 0, replace(OPTICS, tilt_towards_deg=np.degrees(0.02))), expected, atol=1e-12)
+
+
+@given(MM, MM, MM, st.floats(-5, 5), st.floats(-5, 5))
+def test_tilting_back_undoes_tilting(u, v, w, right_deg, towards_deg):
+    how = tilt_of(replace(OPTICS, tilt_deg=right_deg, tilt_towards_deg=towards_deg))
+    np.testing.assert_allclose(tilt_back(*tilt(u, v, w, *how), *how), (u, v, w), atol=1e-9)
 
 
 @given(MM, MM, MM)

@@ -14,7 +14,9 @@ from strandscope.core.geometry import Optics, camera_points, object_points, pixe
 from strandscope.core.groom import Groom, GroomParams, groom
 from strandscope.core.simulate import (
     BLACK,
+    MISALIGNED,
     WHITE,
+    Misalignment,
     Samples,
     Scale,
     Shade,
@@ -44,11 +46,11 @@ def fibers(*ends, radius_mm=0.04):
     return Groom(np.concatenate(curves), np.arange(len(ends) + 1) * 200, np.full(len(ends), radius_mm))
 
 
-def flat(lock, angle_deg, brightness=1.0):
+def flat(lock, angle_deg, brightness=1.0, optics=None):
     """A drawing in which each fiber has one brightness."""
     hair = prepare(lock, np.random.default_rng(0))
     color = np.broadcast_to(np.broadcast_to(brightness, len(lock))[hair.fiber, None], (len(hair.fiber), 3))
-    return drawing(hair, angle_deg, Shade(color.astype(np.float32), np.zeros(len(hair.fiber), np.float32)))
+    return drawing(hair, angle_deg, Shade(color.astype(np.float32), np.zeros(len(hair.fiber), np.float32)), optics)
 
 
 def take(drawn, focus_mm, depth_mm=1.0, optics=OPTICS, seed=0, count=None):
@@ -441,3 +443,45 @@ def test_the_board_is_blue_and_hair_stands_out_in_red():
         assert blue > 2 * red
         assert blue > green
         assert look.hair[0] > look.hair[1] > look.hair[2]
+
+
+# ---- a rig that is not as stated -------------------------------------------------------------------------------------
+
+
+def test_the_misalignment_of_the_command_line_is_the_one_documented():
+    capture = module.plan("out", SimulateParams(scale="tiny"))
+    errors = MISALIGNED.errors(capture)
+    assert (errors.axis_px, errors.tilt_deg, errors.tilt_towards_deg, errors.focus_mm, errors.working_distance_mm) == (3, 0.2, 0.2, 0.2, 2)
+    assert errors.angles_deg == (0.0,) * 8 + (0.1,) * 8  # one step slips, and all later sweeps are off
+    np.testing.assert_allclose(errors.gains, np.tile(np.linspace(0.975, 1.025, 19), (16, 1)))
+    assert Misalignment(every_step_deg=0.1).errors(capture).angles_deg == pytest.approx(0.1 * np.arange(16))
+
+
+def test_a_misaligned_rig_sees_a_fiber_where_its_true_optics_put_it():
+    """The photograph is made with the true optics: the crest of a fiber lies where they say, and not where the stated ones do."""
+    capture = replace(module.plan("out", SimulateParams(scale="tiny")), optics=OPTICS)
+    rig = replace(MISALIGNED, tilt_deg=2.0, tilt_towards_deg=-1.0).errors(capture).corrected(capture)
+    angle, lock = rig.sweeps[9].angle_deg, fibers(((0.6, -4, 0.3), (0.9, 4, 0.5)))
+    leaning = flat(lock, angle, optics=rig.optics)
+    for row in (20, 100, 180):
+        place = pixels(lock.points_mm, angle, 0.0, rig.optics)
+        at = int(np.argmin(np.abs(place[:, 1] - row)))
+        red = take(leaning, place[at, 2], optics=rig.optics)[0]
+        seen = pixels(lock.points_mm[at], angle, place[at, 2], rig.optics)
+        line = red[round(seen[1])]
+        crest = (line * np.arange(len(line))).sum() / line.sum()
+        assert crest == pytest.approx(seen[0], abs=0.3)
+    assert abs(pixels(lock.points_mm, capture.sweeps[9].angle_deg, 0.0, OPTICS) - place)[:, 0].max() > 2
+
+
+def test_stated_and_true_rig_differ_in_the_photographs_alone(tmp_path, done):
+    crooked = replace(PARAMS, misalignment=MISALIGNED)
+    simulate(tmp_path / "crooked", crooked, workers=2)
+    there, here = load_capture(tmp_path / "crooked"), load_capture(done)
+    assert (there.optics, [s.angle_deg for s in there.sweeps]) == (here.optics, [s.angle_deg for s in here.sweeps])
+    assert there.unknown["simulation"]["misalignment"]["axis_px"] == 3
+    truths = [np.load(folder / "truth.npz") for folder in (tmp_path / "crooked", done)]
+    assert all(np.array_equal(truths[0][name], truths[1][name]) for name in truths[0].files if name != "visibility")
+    # light drifts by 5 %: the board's corner, far from the hair, in the first and the last photograph of a sweep
+    first, last = (there.planes(there.sweeps[1].files[i], "B")[0, :6, :6].mean() for i in (0, -1))
+    assert last / first == pytest.approx(1.025 / 0.975, abs=0.01)
