@@ -80,9 +80,6 @@ class GrowParams:
     radius_mm: float = 0.04
 
 
-PAPER = GrowParams()
-
-
 @dataclass(frozen=True)
 class Grown:
     """M captured curves of N points, flat."""

@@ -22,11 +22,13 @@ from .errors import CaptureError, StrandscopeError
 from .features import SweepFeatures, build_index, load_features, pack, save_features, seen_by, unpack, upright
 from .files import atomic
 from .geometry import Optics
-from .grow import PAPER, Grown, GrowParams, grow
+from .grow import Grown, GrowParams, grow
 from .hull import Grid, HullParams, blueness, carve, grid_of, occupancy, visual_hull
 from .infill import InfillParams, infill
 from .match import Reach, sides_of, sightings
+from .paper import PaperParams, grow_paper
 from .progress import Progress, silent
+from .refine import RefineParams, trace
 from .ridges import RidgeParams, Ridges, detect, estimate
 from .rig.calibrate import (
     ANGLE_FLOOR_DEG,
@@ -60,6 +62,8 @@ class Parameters:
 
     ridges: RidgeParams = field(default_factory=RidgeParams)
     grow: GrowParams = field(default_factory=GrowParams)
+    refine: RefineParams = field(default_factory=RefineParams)
+    paper: PaperParams | None = None  # not None: fibers are grown the paper's way, and ``grow`` and ``refine`` do not count
     hull: HullParams = field(default_factory=HullParams)
     infill: InfillParams | None = field(default_factory=InfillParams)  # None: captured fibers only
 
@@ -74,7 +78,7 @@ def preset(name: str = "auto", method: str = "strandscope") -> Parameters:
     bounds = {"cone_deg": omega, "max_correction_px": gamma, "box_px": boxes}
     if method == "paper":
         ridges = RidgeParams("paper", low=0.03, high=0.08, offset=(c + 128) / (4095 - 128))
-        return Parameters(ridges=ridges, grow=replace(PAPER, **bounds))
+        return Parameters(ridges=ridges, paper=replace(PaperParams(), **bounds))
     return Parameters(grow=replace(GrowParams(), **bounds))
 
 
@@ -102,7 +106,11 @@ def reconstruct(
     work = work_folder(capture, Path(out), parameters)
     sweeps = find_features(capture, work, parameters, workers, progress)
     _check_memory(sweeps, memory_bytes)
-    grown = grow(build_index(sweeps, capture.optics), parameters.grow, workers, progress)
+    index = build_index(sweeps, capture.optics)
+    if parameters.paper is not None:
+        grown = grow_paper(index, parameters.paper, progress)
+    else:
+        grown = trace(index, parameters.grow, parameters.refine, workers, progress)
     if len(grown.offsets) < 2:
         raise StrandscopeError(
             f"{capture.folder}: no fiber was found in {sum(map(len, sweeps))} features; expected hairs in focus in the photographs"
@@ -473,7 +481,8 @@ def read_toml(path: Path) -> Parameters:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise StrandscopeError(f"{path}: not valid TOML: {error}") from error
     without = tables.get("infill") is False
-    parameters = _filled(Parameters(), {k: v for k, v in tables.items() if not (without and k == "infill")}, path, "")
+    start = Parameters(paper=PaperParams()) if "paper" in tables else Parameters()
+    parameters = _filled(start, {k: v for k, v in tables.items() if not (without and k == "infill")}, path, "")
     return replace(parameters, infill=None) if without else parameters
 
 

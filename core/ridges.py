@@ -31,8 +31,8 @@ class RidgeParams:
     """What counts as a ridge. Lengths in pixels of the channel plane, light in parts of white."""
 
     operator: str = "oriented"  # or "paper"
-    low: float = 0.07  # hysteresis: strength that continues a ridge
-    high: float = 0.15  # hysteresis: strength that begins one
+    low: float = 0.05  # hysteresis: strength that continues a ridge
+    high: float = 0.12  # hysteresis: strength that begins one
     offset: float | None = None  # c: light added to the denominator, so that grain in the dark makes no ridges; None: estimated
     blur_px: float = 1.0  # paper: sigma of the Gaussian before all else
     across_px: float = 0.7  # oriented: sigma of the line filter across the hair

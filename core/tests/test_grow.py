@@ -1,13 +1,11 @@
 """Growing against curves that are known: what comes out lies on them, covers them, and nothing else comes out."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from strandscope.core.features import build_index
-from strandscope.core.grow import PAPER, GrowParams, Stop, grow, solve_correction, solve_direction
+from strandscope.core.grow import GrowParams, Stop, grow, solve_direction
 
 from .known import OPTICS, Seen, helix, in_volume, line, observe, wave
 
@@ -85,13 +83,6 @@ def test_perspective_is_that_of_the_lens(truth):
     more: 9 degrees. Ribbons and planes that lean the wrong way do not meet in the fiber."""
     seen = Seen(distance_mm=12.0, noise_px=0.1, noise_deg=1.0)
     assert_each_found_once([truth], grown_from([truth], seen), seen, 2 * ON_CURVE_MM)
-
-
-@pytest.mark.parametrize("truth", [line(), SLANTED, helix(), helix(right_handed=False), wave()])
-def test_a_fiber_is_found_the_paper_s_way(truth):
-    grown = grown_from([truth], Seen(), PAPER)
-    assert_each_found_once([truth], grown, Seen())
-    assert np.all(grown.stops == Stop.LEFT_VOLUME)
 
 
 @pytest.mark.parametrize("right_handed", [True, False])
@@ -245,7 +236,7 @@ def test_progress_goes_forward_and_ends():
     assert 0 <= shares[0] <= shares[-1] == 1
 
 
-# ---- the two least-squares problems ----------------------------------------------------------------------------------
+# ---- the direction of a seed ----------------------------------------------------------------------------------
 
 
 def unit(rows):
@@ -264,32 +255,3 @@ def test_direction_is_the_last_singular_vector():
             # four steps of inverse iteration, each shrinking the error by the ratio of eigenvalues, here below 0.1
             assert np.abs(found - wanted * np.sign(wanted @ guess)).max() < 1e-3
             assert np.linalg.norm(found) == pytest.approx(1, abs=1e-9)
-
-
-def test_correction_is_the_least_squares_solution_across_the_hair():
-    rng = np.random.default_rng(9)
-    for _ in range(100):
-        g = unit(rng.normal(size=3))
-        across = unit(np.cross(g, rng.normal(size=(10, 3))))
-        weights = rng.uniform(0.2, 3, 10) * (rng.random(10) < 0.8)
-        offsets = across @ rng.normal(0, 0.02, 3) + rng.normal(0, 0.002, 10)
-        basis = np.linalg.svd(g[None])[2][1:]  # two directions across g
-        root = np.sqrt(weights)
-        wanted = np.linalg.lstsq(root[:, None] * (across @ basis.T), root * offsets)[0] @ basis
-        least = np.linalg.eigvalsh((across @ basis.T).T @ (weights[:, None] * (across @ basis.T)) / weights.sum())[0]
-        found = solve_correction(across, offsets, weights, g)
-        assert abs(found @ g) < 1e-9
-        # a ridge of 1e-3 of the weights holds what no camera tells; it shortens the rest by at most 1e-3 / least
-        assert np.linalg.norm(found - wanted) <= 2e-3 / least * np.linalg.norm(wanted)
-
-
-def test_a_single_camera_moves_the_point_across_its_ribbon_only():
-    g, t = np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
-    found = solve_correction(np.stack([t, t]), np.array([0.01, 5.0]), np.array([1.0, 0.0]), g)
-    assert found == pytest.approx([0.01, 0, 0], rel=2e-3, abs=1e-9)
-
-
-def test_the_paper_s_parameters_are_table_1():
-    assert (PAPER.step_mm, PAPER.cone_deg, PAPER.max_correction_px, PAPER.box_px) == (0.1, 1.5, 0.5, (40.0, 30.0, 8.0))
-    assert not PAPER.weighted
-    assert replace(PAPER, weighted=True) != PAPER
