@@ -2,7 +2,7 @@
 and is joined to the piece of the same fiber beyond a place where it could not be seen.
 
 A curve is a smoothing spline in its plain form: a point every step, tied to the observations of every camera, with a price on
-the change of its curvature (Whittaker 1923).
+the change of its curvature (Whittaker 1923), which is the price that makes the observations likeliest.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 from scipy.interpolate import CubicHermiteSpline
-from scipy.linalg import solveh_banded
+from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.spatial import cKDTree
 
 from .features import USED, Index
@@ -22,6 +22,7 @@ from .progress import Progress, silent
 from .stops import Stop
 
 _turn_back = njit(turn_back)
+JERKS_PER_MM2 = tuple(0.015 * 2.0**i for i in range(9))  # change of curvature a mm, at random each step, from straight hair to tight curls
 STIFF = 10.0  # cameras: what holds a point in its place along the hair
 
 
@@ -31,7 +32,6 @@ class RefineParams:
 
     rounds: int = 3  # of the fit: ties are found anew where the curve has moved
     slab_px: float = 0.4  # error of what one camera says of one step of a curve, rows and frames that err alike included
-    jerk_per_mm2: float = 0.05  # change of curvature a mm that costs as much as that error
     near_mm: float = 0.6  # evidence of a point is that of this length around it
     step_evidence: tuple[float, float, float] = (3.0, 2.0, 1.5)  # evidence that a step needs in the rounds of ``trace``
     new_evidence: float = 2.0  # no new curve is begun in a round that asks for less
@@ -91,31 +91,40 @@ def _tie(index, points, box, normal, right):
                     normal[j, c, d] += share * t[c] * t[d]
 
 
-def smoothed(points: np.ndarray, normal: np.ndarray, right: np.ndarray, price: float) -> np.ndarray:
+def smoothed(points: np.ndarray, normal: np.ndarray, right: np.ndarray, price: float) -> tuple[np.ndarray, float]:
     """points (n, 3) moved to the least of: what ``normal`` (n, 3, 3) and ``right`` (n, 3) say of each point's move, and
-    ``price`` times the square of the third differences of the moved curve. A banded system, O(n)."""
+    ``price`` times the square of the third differences of the moved curve; and the logarithm of how likely such ties are
+    if that is the price, but for a constant. normal and right in units of the ties' own errors. A banded system, O(n).
+    """
     n = len(points)
     if n < 4:
-        return points
+        return points, 0.0
     third = np.array([-1.0, 3.0, -3.0, 1.0])
     bands, pull = np.zeros((10, 3 * n)), right.copy()
     for c in range(3):
         for d in range(c, 3):
             bands[9 - (d - c), d::3] = normal[:, c, d]
-    jump = points[3:] - 3 * points[2:-1] + 3 * points[1:-2] - points[:-3]
+    jump = np.diff(points, 3, axis=0)
     for a in range(4):
         pull[a : n - 3 + a] -= price * third[a] * jump
         for b in range(a, 4):
             bands[9 - 3 * (b - a), 3 * b : 3 * (n - 3 + b)] += price * third[a] * third[b]
     bands[9] += 1e-9
-    return points + solveh_banded(bands, pull.reshape(-1)).reshape(n, 3)
+    factor = cholesky_banded(bands)
+    move = cho_solve_banded((factor, False), pull.reshape(-1)).reshape(n, 3)
+    misfit = np.einsum("ni,nij,nj", move, normal, move) - 2 * np.sum(right * move) + price * np.sum(np.diff(points + move, 3, axis=0) ** 2)
+    likely = 1.5 * (n - 3) * np.log(price) - np.log(factor[9]).sum() - 0.5 * misfit
+    return points + move, float(likely)
 
 
-def _fitted(index: Index, points: np.ndarray, box: _Box, price: float, rounds: int) -> np.ndarray:
+def _fitted(index: Index, points: np.ndarray, box: _Box, params: RefineParams) -> np.ndarray:
+    """Points (n, 3) of a curve fitted to its observations, as stiff as these make likely (empirical Bayes)."""
     normal, right = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
-    for _ in range(rounds):
+    error = params.slab_px * index.pitch
+    for _ in range(params.rounds):
         _tie(index, points, box, normal, right)
-        points = np.ascontiguousarray(smoothed(points, normal, right, price))
+        fits = [smoothed(points, normal / error**2, right / error**2, (box.step**3 * jerk) ** -2) for jerk in JERKS_PER_MM2]
+        points = np.ascontiguousarray(max(fits, key=lambda fit: fit[1])[0])
     return points
 
 
@@ -172,7 +181,6 @@ class _Work:
     box: _Box  # as for growing
     slab: _Box  # half a step to either side
     near: _Box  # the length over which evidence is weighed
-    price: float
     each: Callable  # each(function, items): a list, on all threads
 
 
@@ -217,7 +225,6 @@ def _work(index: Index, params: RefineParams, grow_params: GrowParams, each: Cal
         box=box,
         slab=box._replace(half=(0.5 * box.step, box.half[1], wide), full_support=slab * box.full_support),
         near=box._replace(half=(0.5 * params.near_mm, box.half[1], wide), full_support=near * box.full_support, min_support=near * box.min_support),
-        price=params.slab_px**2 * index.pitch**2 / (box.step**3 * params.jerk_per_mm2) ** 2,
         each=each,
     )
 
@@ -238,7 +245,7 @@ def _fit_all(curves: list[Curve], work: _Work) -> list[Curve]:
     def one(curve: Curve) -> Curve:
         if curve.fitted:
             return curve
-        points = _fitted(work.index, np.ascontiguousarray(curve.points), work.slab, work.price, work.params.rounds)
+        points = _fitted(work.index, np.ascontiguousarray(curve.points), work.slab, work.params)
         evidence = np.empty(len(points))
         _weigh(work.index, points, work.near, evidence)
         return Curve(points, evidence, curve.stops, fitted=True)
