@@ -228,7 +228,7 @@ def work_folder(capture: Capture, out: Path, parameters: Parameters) -> Path:
     return work
 
 
-def haswork_folder(capture: Capture, out: Path, parameters: Parameters) -> bool:
+def has_work_folder(capture: Capture, out: Path, parameters: Parameters) -> bool:
     """Whether a run of this capture with these parameters of the filter left its folder beside ``out``."""
     stamp = _work_path(out) / STAMP
     return stamp.is_file() and stamp.read_text() == _made_from(capture, parameters)
@@ -503,8 +503,8 @@ def _filled(record, values: dict, path: Path, where: str):
         elif isinstance(old, tuple):
             good = isinstance(value, list) and len(value) == len(old) and all(_is_number(v) for v in value)
             changes[name] = tuple(map(float, value)) if good else _wrong(path, where + name, value, f"{len(old)} numbers")
-        elif isinstance(old, bool | str):
-            changes[name] = value if isinstance(value, type(old)) else _wrong(path, where + name, value, type(old).__name__)
+        elif isinstance(old, str):
+            changes[name] = value if isinstance(value, str) else _wrong(path, where + name, value, "str")
         else:
             changes[name] = value if _is_number(value) else _wrong(path, where + name, value, "a number")
     return replace(record, **changes)

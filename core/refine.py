@@ -23,6 +23,7 @@ from .stops import Stop
 
 _turn_back = njit(turn_back)
 JERKS_PER_MM2 = tuple(0.015 * 2.0**i for i in range(9))  # change of curvature a mm, at random each step, from straight hair to tight curls
+GROWING_SHARE = 0.6  # of the time of a round
 STIFF = 10.0  # cameras: what holds a point in its place along the hair
 
 
@@ -31,7 +32,7 @@ class RefineParams:
     """How curves are grown in rounds, fitted, cut and joined."""
 
     rounds: int = 3  # of the fit: ties are found anew where the curve has moved
-    slab_px: float = 0.4  # error of what one camera says of one step of a curve, rows and frames that err alike included
+    slab_px: float = 0.2  # error of what one camera says of one step of a curve, rows and frames that err alike included
     near_mm: float = 0.6  # evidence of a point is that of this length around it
     step_evidence: tuple[float, float, float] = (3.0, 2.0, 1.5)  # evidence that a step needs in the rounds of ``trace``
     new_evidence: float = 2.0  # no new curve is begun in a round that asks for less
@@ -202,7 +203,8 @@ def trace(index: Index, grow_params: GrowParams, params: RefineParams, workers: 
                 grown = grow(index, growing, workers, told)
                 tried = max(tried, grown.tried)
                 curves = curves + _curves(grown)
-            for stage in (_fit_all, _cut_all, _once, _join, _fit_all, _extend, _fit_all, _cut_all, _once, _join, _fit_all):
+            for i, stage in enumerate(STAGES):
+                told("growing", 1 + i / len(STAGES) * (1 / GROWING_SHARE - 1), 1)
                 index.strength[:] &= USED - 1
                 curves = stage(curves, work)
             curves = _keep(curves, work)
@@ -211,8 +213,8 @@ def trace(index: Index, grow_params: GrowParams, params: RefineParams, workers: 
 
 
 def _part_of(progress: Progress, number: int, rounds: int) -> Progress:
-    """Progress of one round as part of all."""
-    return lambda stage, done, total: progress(stage, number + done / max(total, 1), rounds)
+    """Progress of the growing of one round as part of all."""
+    return lambda stage, done, total: progress(stage, number + GROWING_SHARE * done / max(total, 1), rounds)
 
 
 def _work(index: Index, params: RefineParams, grow_params: GrowParams, each: Callable) -> _Work:
@@ -410,6 +412,9 @@ def _keep(curves: list[Curve], work: _Work) -> list[Curve]:
     """Without those that may be chance."""
     step, params = work.box.step, work.params
     return [c for c in curves if (len(c.points) - 1) * step >= params.min_length_mm and c.evidence.mean() >= params.min_mean_evidence]
+
+
+STAGES = (_fit_all, _cut_all, _once, _join, _fit_all, _extend, _fit_all, _cut_all, _once, _join, _fit_all)  # of a round
 
 
 def _flat(curves: list[Curve], tried: int) -> Grown:

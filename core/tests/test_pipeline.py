@@ -194,9 +194,9 @@ def test_presets_are_table_1():
         # c is a number of 12 bits with the black level, 128, in it
         assert paper.ridges.offset * (4095 - 128) == pytest.approx(c + 128)
         for parameters in (paper, preset(name)):
-            grow = parameters.grow
+            grow = parameters.paper or parameters.grow
             assert (grow.step_mm, grow.cone_deg, grow.max_correction_px, grow.box_px) == (0.1, 1.5, 0.5, box_px)
-        assert not paper.grow.weighted
+        assert paper.paper is not None
         assert preset(name).ridges.offset is None  # estimated
     assert preset() == preset("auto") == preset("straight")
 
@@ -224,7 +224,7 @@ def test_toml_without_a_word_has_the_defaults(tmp_path):
         ("[growing]\ncone_deg = 2.0\n", "growing is not a parameter; expected one of ridges, grow"),
         ("[grow]\ncone_deg = 'wide'\n", "grow.cone_deg is 'wide'; expected a number"),
         ("[grow]\ncone_deg = true\n", "grow.cone_deg is True; expected a number"),
-        ("[grow]\nweighted = 1\n", "grow.weighted is 1; expected bool"),
+        ("[paper]\ngate = 1\n", "paper.gate is not a parameter; expected one of step_mm"),
         ("[grow]\nbox_px = [40, 30]\n", "grow.box_px is [40, 30]; expected 3 numbers"),
         ("[grow]\nbox_px = 40\n", "grow.box_px is 40; expected 3 numbers"),
         ("[ridges]\noperator = 3\n", "ridges.operator is 3; expected str"),
