@@ -183,6 +183,7 @@ class Index(NamedTuple):
     first_position: np.ndarray  # (sweeps + 1,) int64
     cos: np.ndarray  # (sweeps,) of the turntable angle
     sin: np.ndarray
+    around: np.ndarray  # (sweeps,) int64: the sweeps in the order of their angles
     rows: int
     columns: int
     pitch: float
@@ -205,6 +206,7 @@ def build_index(sweeps: Sequence[SweepFeatures], optics: Optics) -> Index:
         first_position=_starts([len(s.positions_mm) for s in sweeps]),
         cos=np.cos(theta),
         sin=np.sin(theta),
+        around=np.argsort(theta % (2 * np.pi), kind="stable"),
         rows=sweeps[0].shape[0],
         columns=sweeps[0].shape[1],
         pitch=optics.pitch_mm,

@@ -47,6 +47,8 @@ BATCH = 64  # seeds grown against the same observations; part of the result, not
 MAX_HITS = 1024  # features that one step looks at, for each camera
 PLACE_PX, ANGLE_RAD = 0.22, 0.0436  # errors of one observation across the hair and of its angle (2.5 degrees)
 TWIST_RAD = 0.0436  # a camera that sees the hair turned by more than this (2.5 degrees) is no evidence for it
+SHARE_POWER = 0.2  # of the share of its observations that a camera has: many that see a little tell more than one that sees all
+UNSEEN = 0.2  # evidence that a camera costs which sees no hair where it should be
 OBSERVED_TOGETHER = 17.0  # observations of one camera in a step that err alike: rows and frames that see the same
 
 
@@ -136,7 +138,7 @@ def _box(params: GrowParams, index: Index) -> _Box:
         shared=params.shared_weight,
         sigma_angle=float(np.radians(params.sigma_deg)),
         sigma_focus=params.sigma_focus_mm,
-        min_support=params.min_support * full_support,
+        min_support=params.min_support,
         full_support=full_support,
         min_evidence=params.min_evidence,
         min_seed_cameras=params.min_seed_cameras,
@@ -226,12 +228,13 @@ class _View(NamedTuple):
     hits: np.ndarray  # (n, 4) observations: along, across (mm), turn (rad), weight
     ends: np.ndarray  # (S + 1,) int64: where each camera's observations begin
     across: np.ndarray  # (S, 3) t of each ribbon, object frame
-    support: np.ndarray  # (S,) weight of the observations that agree
+    full: np.ndarray  # (S,) weight of the observations of a hair in full view; 0 for a camera that cannot see it
+    told: np.ndarray  # (S,) what each camera's observations are worth as evidence, 0 to 1
 
 
 @njit(cache=True, nogil=True)
 def _new_view(cameras):
-    return _View(np.empty((cameras * MAX_HITS, 4)), np.zeros(cameras + 1, np.int64), np.zeros((cameras, 3)), np.zeros(cameras))
+    return _View(np.empty((cameras * MAX_HITS, 4)), np.zeros(cameras + 1, np.int64), np.zeros((cameras, 3)), np.zeros(cameras), np.zeros(cameras))
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -241,6 +244,7 @@ def _look(index, p, g, bend, box, view):
     could = count = 0
     for k in range(len(index.cos)):
         view.ends[k] = count
+        view.full[k] = 0.0
         frame, angle, size = _hair_frame(index, k, p, g)
         if not _sees(index, k, frame[0, 0], frame[0, 1], frame[0, 2]):
             continue
@@ -249,6 +253,7 @@ def _look(index, p, g, bend, box, view):
             continue
         tx, ty, tz = _turn_back(frame[3, 0], frame[3, 1], frame[3, 2], index.cos[k], index.sin[k])
         view.across[k] = tx, ty, tz
+        view.full[k] = max(size, 0.3) * box.full_support
         count = _gather(index, k, frame, angle, bend[0] * tx + bend[1] * ty + bend[2] * tz, box, view.hits, count)
     view.ends[len(index.cos)] = count
     return could
@@ -258,7 +263,23 @@ def _look(index, p, g, bend, box, view):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _fit(view, g, box, wide, prior):
+def _visible_range(view, around):
+    """The evidence of the adjacent cameras that have most: a hair is seen from one range of angles, and a chance meeting of
+    the ribbons of other hairs from here and there. Each camera of the range that could see the hair costs ``UNSEEN``.
+    ``around``: the cameras in the order of their angles, the first follows the last."""
+    total = run = best = lull = worst = 0.0
+    for k in around:
+        worth = view.told[k] - UNSEEN if view.full[k] > 0 else 0.0
+        total += worth
+        run = max(run + worth, 0.0)
+        best = max(best, run)
+        lull = min(lull + worth, 0.0)
+        worst = min(worst, lull)
+    return max(best, total - worst)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _fit(view, around, g, box, wide, prior):
     """The bent line that the observations of ``view`` support: (cameras that agree, evidence, place, direction, curvature).
 
     The last three are vectors (3,) perpendicular to g by which the hair differs from the one looked for: at the way ``a``
@@ -267,23 +288,22 @@ def _fit(view, g, box, wide, prior):
     the time before, and so does a camera as a whole. ``wide`` is the width of that weight in sigma; ``prior`` holds place,
     direction and curvature to what was looked for.
     """
-    cameras = len(view.support)
+    cameras = len(view.told)
     ax, ay = _perpendicular(g)
     theta = np.zeros(6)
     m, b = np.empty((6, 6)), np.empty(6)
     lever = (PLACE_PX / 0.5 * box.sigma / ANGLE_RAD) ** 2
     spoke = 0
-    evidence = 0.0
     for trial in range(4):
         m[:] = 0.0
         b[:] = 0.0
         for c in range(6):
             m[c, c] = prior[c // 2]
             b[c] = 0.0
-        spoke, evidence = 0, 0.0
+        spoke = 0
         narrow = 1 / (wide * box.sigma)
         for k in range(cameras):
-            view.support[k] = 0.0
+            view.told[k] = 0.0
             if view.ends[k + 1] == view.ends[k]:
                 continue
             t = view.across[k]
@@ -310,7 +330,8 @@ def _fit(view, g, box, wide, prior):
                 r2 += waa * across
                 l0 -= w * off
                 l1 -= wa * off
-            if s0 < box.min_support:
+            share = s0 / view.full[k]
+            if share < box.min_support:
                 continue
             far = rest / s0 / (wide * box.agree)
             agree = max(1 - far * far, 0.0) ** 2
@@ -318,8 +339,8 @@ def _fit(view, g, box, wide, prior):
                 continue
             twist = (o1 + (o2 * s1 - l0) / s0) / TWIST_RAD
             spoke += 1
-            view.support[k] = s0 * agree
-            evidence += np.cbrt(min(s0 / box.full_support, 1.0)) * agree * max(1 - twist * twist, 0.0) ** 2
+            if trial == 3:
+                view.told[k] = min(share, 1.0) ** SHARE_POWER * agree * max(1 - twist * twist, 0.0) ** 2
             # rows of the normal matrix: place, direction, curvature along t
             block = (s0, s1, 0.5 * s2, s2 + lever * s0, 0.5 * s3 + lever * s1, 0.25 * s4 + lever * s2)
             right = (r0, r1 + lever * l0, 0.5 * r2 + lever * l1)
@@ -335,7 +356,7 @@ def _fit(view, g, box, wide, prior):
         if spoke == 0 or trial == 3:
             break
         _cholesky_solve(m, b, theta)
-    return spoke, evidence, theta[0] * ax + theta[1] * ay, theta[2] * ax + theta[3] * ay, theta[4] * ax + theta[5] * ay
+    return spoke, _visible_range(view, around), theta[0] * ax + theta[1] * ay, theta[2] * ax + theta[3] * ay, theta[4] * ax + theta[5] * ay
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -455,7 +476,7 @@ def _grow_end(index, box, view, state, evidence, filled, sign):
         could = _look(index, p, g, bend, box, view)
         if could < box.min_cameras:
             return kept, Stop.LEFT_VOLUME.value
-        spoke, seen, place, way, curve = _fit(view, g, box, 1.0, box.prior)
+        spoke, seen, place, way, curve = _fit(view, index.around, g, box, 1.0, box.prior)
         if spoke >= box.min_cameras and seen >= box.min_evidence:
             p = p + _bounded(place, box.gamma)
             g = _within_cone(_unit(g + way), g, box)
@@ -482,7 +503,7 @@ def _snap(index, p, g, least, box, view):
     for trial in range(5):
         _look(index, p, g, bend, box, view)
         # from the middle of a cell the hair may be far
-        spoke, evidence, place, way, curve = _fit(view, g, box, 4.0 if trial == 0 else (2.0 if trial == 1 else 1.0), loose)
+        spoke, evidence, place, way, curve = _fit(view, index.around, g, box, 4.0 if trial == 0 else (2.0 if trial == 1 else 1.0), loose)
         if spoke < box.min_seed_cameras or evidence < least:
             return min(evidence, 0.99 * least), p, g, bend
         p = p + _bounded(place, 2 * box.half[2])

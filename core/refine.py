@@ -34,14 +34,14 @@ class RefineParams:
     rounds: int = 3  # of the fit: ties are found anew where the curve has moved
     slab_px: float = 0.2  # error of what one camera says of one step of a curve, rows and frames that err alike included
     near_mm: float = 0.6  # evidence of a point is that of this length around it
-    step_evidence: tuple[float, float, float] = (3.0, 2.0, 1.7)  # evidence that a step needs in the rounds of ``trace``
-    new_evidence: float = 1.6  # no new curve is begun in a round that asks for less
+    step_evidence: tuple[float, float, float] = (2.5, 1.5, 0.8)  # evidence that a step needs in the rounds of ``trace``
+    new_evidence: float = 0.7  # no new curve is begun in a round that asks for less
     join_mm: float = 3.0  # longest gap over which two pieces are joined
     join_place: tuple[float, float] = (0.02, 0.02)  # mm, and mm a mm of gap: how well two ends must meet in the middle of it
     join_turn_deg: tuple[float, float] = (2.0, 4.0)  # and a mm of gap: how well their directions must agree
     same_mm: float = 0.04  # closer than this to a better curve, along it, a curve is the same hair
     min_length_mm: float = 1.5  # shorter curves are taken for chance
-    min_mean_evidence: float = 2.3  # and those with less evidence
+    mean_evidence: tuple[float, float] = (1.1, 1.3)  # and those that have less evidence than the first, and less than this many mm of it
 
 
 @dataclass(frozen=True)
@@ -133,12 +133,17 @@ def _fitted(index: Index, points: np.ndarray, box: _Box, params: RefineParams) -
 def _weigh(index, points, box, evidence):
     """Evidence (n,) of each point (n, 3) of a curve that is already where it should be."""
     n = len(points)
-    view, straight, free = _new_view(len(index.cos)), np.zeros(3), (1e9, 1e9, 1e9)
+    view, free = _new_view(len(index.cos)), (1e9, 1e9, 1e9)
     for j in range(n):
+        a, b = max(j - 2, 0), min(j + 2, n - 1)
+        m = (a + b) // 2
         g = points[min(j + 1, n - 1)] - points[max(j - 1, 0)]
         g /= np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
-        _look(index, points[j], g, straight, box, view)
-        _, evidence[j], _, _, _ = _fit(view, g, box, 1.0, free)
+        half = 0.5 * (b - a) * box.step
+        bend = (points[a] + points[b] - 2 * points[m]) / (half * half) if b - a == 4 else np.zeros(3)
+        bend -= g * (g[0] * bend[0] + g[1] * bend[1] + g[2] * bend[2])
+        _look(index, points[j], g, bend, box, view)
+        _, evidence[j], _, _, _ = _fit(view, index.around, g, box, 1.0, free)
 
 
 # ---- growing on ------------------------------------------------------------------------------------------------------
@@ -226,7 +231,7 @@ def _work(index: Index, params: RefineParams, grow_params: GrowParams, each: Cal
         params=params,
         box=box,
         slab=box._replace(half=(0.5 * box.step, box.half[1], wide), full_support=slab * box.full_support),
-        near=box._replace(half=(0.5 * params.near_mm, box.half[1], wide), full_support=near * box.full_support, min_support=near * box.min_support),
+        near=box._replace(half=(0.5 * params.near_mm, box.half[1], wide), full_support=near * box.full_support),
         each=each,
     )
 
@@ -409,9 +414,14 @@ def _extend(curves: list[Curve], work: _Work) -> list[Curve]:
 
 
 def _keep(curves: list[Curve], work: _Work) -> list[Curve]:
-    """Without those that may be chance."""
-    step, params = work.box.step, work.params
-    return [c for c in curves if (len(c.points) - 1) * step >= params.min_length_mm and c.evidence.mean() >= params.min_mean_evidence]
+    """Without those that may be chance: a short curve needs more evidence than a long one."""
+    least, extra = work.params.mean_evidence
+    lengths = [(len(c.points) - 1) * work.box.step for c in curves]
+    return [
+        c
+        for c, length in zip(curves, lengths, strict=True)
+        if length >= work.params.min_length_mm and c.evidence.mean() >= least * (1 + extra / length)
+    ]
 
 
 STAGES = (_fit_all, _cut_all, _once, _join, _fit_all, _extend, _fit_all, _cut_all, _once, _join, _fit_all)  # of a round
