@@ -46,9 +46,10 @@ _turn, _turn_back, _slope, _to_pixel, _to_image, _project = (
 BATCH = 64  # seeds grown against the same observations; part of the result, not of the machine
 MAX_HITS = 1024  # features that one step looks at, for each camera
 PLACE_PX, ANGLE_RAD = 0.22, 0.0436  # errors of one observation across the hair and of its angle (2.5 degrees)
-TWIST_RAD = 0.0436  # a camera that sees the hair turned by more than this (2.5 degrees) is no evidence for it
-SHARE_POWER = 0.2  # of the share of its observations that a camera has: many that see a little tell more than one that sees all
-UNSEEN = 0.2  # evidence that a camera costs which sees no hair where it should be
+TWIST_RAD = 0.0698  # a camera that sees the hair turned by more than this (4 degrees) is no evidence for it
+SHARE_POWER = 0.1  # of the share of its observations that a camera has: many that see a little tell more than one that sees all
+UNSEEN = 0.15  # evidence that a camera costs which sees no hair where it should be
+SPREAD_PX = (0.18, 0.3)  # of a hair's observations across it; a camera whose observations spread by the second more tells nothing
 OBSERVED_TOGETHER = 17.0  # observations of one camera in a step that err alike: rows and frames that see the same
 
 
@@ -104,6 +105,7 @@ class _Box(NamedTuple):
     min_cameras: int
     bridge: int
     max_points: int
+    pixel: float
     sigma: float
     agree: float
     claim: float
@@ -132,6 +134,7 @@ def _box(params: GrowParams, index: Index) -> _Box:
         min_cameras=params.min_cameras,
         bridge=round(params.bridge_mm / params.step_mm),
         max_points=int(0.5 * params.max_length_mm / params.step_mm),
+        pixel=pitch_mm,
         sigma=params.sigma_px * pitch_mm,
         agree=params.agree_px * pitch_mm,
         claim=params.claim_px * pitch_mm,
@@ -292,7 +295,7 @@ def _fit(view, around, g, box, wide, prior):
     ax, ay = _perpendicular(g)
     theta = np.zeros(6)
     m, b = np.empty((6, 6)), np.empty(6)
-    lever = (PLACE_PX / 0.5 * box.sigma / ANGLE_RAD) ** 2
+    lever = (PLACE_PX * box.pixel / ANGLE_RAD) ** 2
     spoke = 0
     for trial in range(4):
         m[:] = 0.0
@@ -309,7 +312,7 @@ def _fit(view, around, g, box, wide, prior):
             t = view.across[k]
             tx, ty = t[0] * ax[0] + t[1] * ax[1] + t[2] * ax[2], t[0] * ay[0] + t[1] * ay[1] + t[2] * ay[2]
             o0, o1, o2 = theta[0] * tx + theta[1] * ty, theta[2] * tx + theta[3] * ty, theta[4] * tx + theta[5] * ty
-            s0 = s1 = s2 = s3 = s4 = r0 = r1 = r2 = l0 = l1 = rest = 0.0
+            s0 = s1 = s2 = s3 = s4 = r0 = r1 = r2 = l0 = l1 = rest = rest2 = 0.0
             for i in range(view.ends[k], view.ends[k + 1]):
                 a, across, off, w = view.hits[i]
                 left = across - (o0 + a * (o1 + 0.5 * a * o2))
@@ -325,6 +328,7 @@ def _fit(view, around, g, box, wide, prior):
                 s3 += waa * a
                 s4 += waa * a * a
                 rest += w * left
+                rest2 += w * left * left
                 r0 += w * across
                 r1 += wa * across
                 r2 += waa * across
@@ -340,7 +344,9 @@ def _fit(view, around, g, box, wide, prior):
             twist = (o1 + (o2 * s1 - l0) / s0) / TWIST_RAD
             spoke += 1
             if trial == 3:
-                view.told[k] = min(share, 1.0) ** SHARE_POWER * agree * max(1 - twist * twist, 0.0) ** 2
+                spread = np.sqrt(max(rest2 / s0 - (rest / s0) ** 2, 0.0)) / (wide * box.pixel)
+                sharp = min(max(1 - (spread - SPREAD_PX[0]) / SPREAD_PX[1], 0.1), 1.2)
+                view.told[k] = min(share, 1.0) ** SHARE_POWER * agree * max(1 - twist * twist, 0.0) ** 2 * sharp
             # rows of the normal matrix: place, direction, curvature along t
             block = (s0, s1, 0.5 * s2, s2 + lever * s0, 0.5 * s3 + lever * s1, 0.25 * s4 + lever * s2)
             right = (r0, r1 + lever * l0, 0.5 * r2 + lever * l1)
@@ -663,8 +669,16 @@ def _seed_grid(index: Index, params: GrowParams) -> _Grid:
     return _Grid(low, params.seed_cell_mm, shape)
 
 
-def _seeds(index: Index, params: GrowParams) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (n, 3) mm of the cells that at least ``min_seed_cameras`` sweeps recorded, most angles first, and how many (n,)."""
+@dataclass(frozen=True)
+class Seeds:
+    """Places where a fiber may begin, most promising first."""
+
+    centres: np.ndarray  # (n, 3) mm
+    bound: np.ndarray  # (n,) the most evidence that each can have: as many as cameras recorded it, and what was found there; falls
+
+
+def find_seeds(index: Index, params: GrowParams) -> Seeds:
+    """The cells that at least ``min_seed_cameras`` sweeps recorded, most angles first."""
     grid = _seed_grid(index, params)
     masks = np.zeros(grid.shape, np.uint64)
     _raster(index, grid, masks)
@@ -674,33 +688,34 @@ def _seeds(index: Index, params: GrowParams) -> tuple[np.ndarray, np.ndarray]:
     shuffled = np.random.default_rng(0).permutation(len(cells))  # neighbours in a batch would grow the same fiber
     order = shuffled[np.argsort(-found[shuffled].astype(int), kind="stable")]
     where = np.stack(np.unravel_index(cells[order], grid.shape), -1)
-    return grid.low + (where + 0.5) * grid.cell, counts.ravel()[cells[order]]
+    return Seeds(grid.low + (where + 0.5) * grid.cell, counts.ravel()[cells[order]].astype(float))
 
 
 # ---- the whole -------------------------------------------------------------------------------------------------------
 
 
-def grow(index: Index, params: GrowParams, workers: int = 1, progress: Progress = silent) -> Grown:
+def grow(index: Index, params: GrowParams, workers: int = 1, progress: Progress = silent, seeds: Seeds | None = None) -> Grown:
     """Every fiber that the observations support, on ``workers`` threads. Uses up ``index.strength``.
+
+    seeds: where to begin; what is found there lowers their bound, so that growing again looks at the rest. None: all there are.
 
     Deterministic: the same index and parameters give the same curves in the same order, whatever the number of threads.
     """
     box = _box(params, index)
-    centres, cameras = _seeds(index, params)
-    bound = cameras.astype(float)  # the most evidence that each seed can have: a camera's is 1, and it can only fall
+    seeds = seeds or find_seeds(index, params)
     store = _BatchStore.of(BATCH, 2 * min(box.max_points, _longest(index, params)) + 1)
     curves: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     with ThreadPoolExecutor(workers) as pool:
         for number, share in enumerate(params.seed_evidence):
             least = share * params.min_evidence
-            seeds = np.flatnonzero(bound >= least)
-            for first in range(0, len(seeds), BATCH):
-                progress("growing", number + first / max(len(seeds), 1), len(params.seed_evidence))
-                chosen = seeds[first : first + BATCH]
-                bound[chosen] = _grow_batch(pool, index, centres[chosen], least, params, box, store)
+            promising = np.flatnonzero(seeds.bound >= least)
+            for first in range(0, len(promising), BATCH):
+                progress("growing", number + first / max(len(promising), 1), len(params.seed_evidence))
+                chosen = promising[first : first + BATCH]
+                seeds.bound[chosen] = _grow_batch(pool, index, seeds.centres[chosen], least, params, box, store)
                 curves += _accept(index, store, len(chosen), params.mean_share * least, params, box)
     progress("growing", len(params.seed_evidence), len(params.seed_evidence))
-    return _flat(curves, len(centres))
+    return _flat(curves, len(seeds.centres))
 
 
 def _grow_batch(pool: ThreadPoolExecutor, index: Index, seeds: np.ndarray, least: float, params: GrowParams, box: _Box, store: "_BatchStore"):

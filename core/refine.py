@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from .features import USED, Index
 from .geometry import turn_back
-from .grow import MAX_HITS, Grown, GrowParams, _Box, _box, _claim, _fit, _gather, _grow_end, _hair_frame, _look, _new_view, _sees, grow
+from .grow import MAX_HITS, Grown, GrowParams, _Box, _box, _claim, _fit, _gather, _grow_end, _hair_frame, _look, _new_view, _sees, find_seeds, grow
 from .progress import Progress, silent
 from .stops import Stop
 
@@ -197,7 +197,7 @@ def trace(index: Index, grow_params: GrowParams, params: RefineParams, workers: 
     The same for any number of ``workers``: each curve is fitted alone, and what compares curves runs in a fixed order.
     """
     curves: list[Curve] = []
-    tried = 0
+    seeds = find_seeds(index, grow_params)
     for number, evidence in enumerate(params.step_evidence):
         told = _part_of(progress, number, len(params.step_evidence))
         growing = replace(grow_params, min_evidence=evidence)
@@ -205,16 +205,14 @@ def trace(index: Index, grow_params: GrowParams, params: RefineParams, workers: 
             work = _work(index, params, growing, lambda function, items, pool=pool: list(pool.map(function, items)))
             if evidence >= params.new_evidence:
                 _mark(curves, work)
-                grown = grow(index, growing, workers, told)
-                tried = max(tried, grown.tried)
-                curves = curves + _curves(grown)
+                curves = curves + _curves(grow(index, growing, workers, told, seeds))
             for i, stage in enumerate(STAGES):
                 told("growing", 1 + i / len(STAGES) * (1 / GROWING_SHARE - 1), 1)
                 index.strength[:] &= USED - 1
                 curves = stage(curves, work)
             curves = _keep(curves, work)
     progress("growing", 1, 1)
-    return _flat(curves, tried)
+    return _flat(curves, len(seeds.centres))
 
 
 def _part_of(progress: Progress, number: int, rounds: int) -> Progress:
