@@ -6,7 +6,10 @@ Two operators give the same records:
               photograph across that orientation, its relative height M' = (M - Mmax) / (Mmax + c), hysteresis.
 ``oriented``  Ours: a bank of line filters, narrow across the hair and long along it, and the maximum and the thresholds are
               those of the filter's own response, over the light around it. Clutter from the hairs beside and behind limits
-              detection, and a long filter averages it away.
+              detection in photographs of little grain, and a narrow filter keeps it out; a long one averages grain away.
+              What is kept are runs: ridge pixels each of which continues the one before in place and angle, and whose
+              mean strength over the length of the run is enough. Grain and rungs between hairs are strong only shortly;
+              half hidden hair is weak for a long way.
 
 Both give the position along the normal and the angle between the bins of the bank. Angles are those of the hair in the
 image, from +u (right) towards +v (up), in [0, pi).
@@ -22,8 +25,10 @@ from scipy import ndimage
 from threadpoolctl import ThreadpoolController
 
 BINS = 32  # orientations of a bank, over 180 degrees
+LIGHT_PX = 8.0  # sigma of the Gaussian that tells the light around a pixel
 LIGHT_TO_OFFSET = 1.2  # c of the oriented operator, in parts of the light around clear hairs
-GRAIN_TO_OFFSET = 12.0  # and in standard deviations of the grain
+GRAIN_TO_OFFSET = 60.0  # and in standard deviations of the grain
+BESIDE_PX, TURN_DEG = 0.8, 20.0  # how far the next pixel of a run may lie beside the way of one, and be turned
 
 
 @dataclass(frozen=True)
@@ -31,12 +36,13 @@ class RidgeParams:
     """What counts as a ridge. Lengths in pixels of the channel plane, light in parts of white."""
 
     operator: str = "oriented"  # or "paper"
-    low: float = 0.05  # hysteresis: strength that continues a ridge
-    high: float = 0.12  # hysteresis: strength that begins one
+    low: float = 0.02  # strength of a ridge pixel that may be part of a run (paper: that continues a ridge)
+    high: float = 0.035  # mean strength of a run (paper: strength that begins a ridge)
+    run_px: int = 7  # oriented: ridge pixels in a run
     offset: float | None = None  # c: light added to the denominator, so that grain in the dark makes no ridges; None: estimated
     blur_px: float = 1.0  # paper: sigma of the Gaussian before all else
-    across_px: float = 0.7  # oriented: sigma of the line filter across the hair
-    along_px: float = 4.0  # oriented: sigma of the line filter along the hair
+    across_px: float = 0.6  # oriented: sigma of the line filter across the hair
+    along_px: float = 6.0  # oriented: sigma of the line filter along the hair, which ends at 4/3 of it
     turn_px: float = 0.9  # oriented: sigma across of the filter that measures the angle; a narrow one misjudges upright hair
 
 
@@ -59,7 +65,7 @@ def estimate(planes: Sequence[np.ndarray], params: RidgeParams) -> RidgeParams:
     """
     light, grain = [], []
     for plane in planes:
-        around = ndimage.gaussian_filter(plane, 2.0 * params.along_px)
+        around = ndimage.gaussian_filter(plane, LIGHT_PX)
         strength, _, _ = _measure(plane, replace(params, offset=float(plane.mean())))
         light.append(around[strength >= np.quantile(strength, 0.995)])
         grain.append(noise(plane))
@@ -79,7 +85,7 @@ def detect(plane: np.ndarray, params: RidgeParams) -> Ridges:
     Each is one pixel wide; col and row are moved along the normal to the crest.
     """
     strength, angle, shift = _measure(plane, params)
-    rows, cols = np.nonzero(_hysteresis(strength, params.low, params.high))
+    rows, cols = np.nonzero(_kept(strength, angle, shift, params))
     angle, shift = angle[rows, cols], shift[rows, cols]
     # the normal of a hair at `angle` is (-sin, cos) in (u, v); rows run down, v runs up
     col, row = cols - shift * np.sin(angle), rows - shift * np.cos(angle)
@@ -88,8 +94,15 @@ def detect(plane: np.ndarray, params: RidgeParams) -> Ridges:
 
 def response(plane: np.ndarray, params: RidgeParams) -> np.ndarray:
     """Strength (H, W) float32 of the ridge at each pixel of a channel plane (H, W), 0 where there is none; for pictures."""
-    strength, _, _ = _measure(plane, params)
-    return np.where(_hysteresis(strength, params.low, params.high), strength, 0).astype(np.float32)
+    strength, angle, shift = _measure(plane, params)
+    return np.where(_kept(strength, angle, shift, params), strength, 0).astype(np.float32)
+
+
+def _kept(strength, angle, shift, params):
+    """Which crests (H, W) are ridges, bool."""
+    if params.operator == "paper":
+        return _hysteresis(strength, params.low, params.high)
+    return _runs(strength, angle, shift, params.low, params.high, params.run_px)
 
 
 def _measure(plane, params):
@@ -113,7 +126,7 @@ def _measure_alone(plane, params):
         return _relative_peaks(blurred, _folded(bank), bank.shape[1] // 2, np.float32(params.offset), np.float32(params.low))
     even, odd = line_banks(params.across_px, params.along_px)
     wide, _ = line_banks(params.turn_px, params.along_px)
-    light = ndimage.gaussian_filter(plane, 2.0 * params.along_px)
+    light = ndimage.gaussian_filter(plane, LIGHT_PX)
     return _line_peaks(plane, _folded(even), odd, wide, light, np.float32(params.offset), np.float32(params.low))
 
 
@@ -145,7 +158,7 @@ def line_banks(across_px: float, along_px: float) -> tuple[np.ndarray, np.ndarra
     Two arrays (32, k, k) float32. The even one is zero-mean and scaled so that a line of that very profile and height 1
     gives 1; the odd one shares the scale, so odd / even is the way to the crest in pixels (Steger 1998, sec. 2).
     """
-    across, along = _rotated_grid(int(np.ceil(2.0 * max(along_px, 1.5 * across_px))))
+    across, along = _rotated_grid(int(np.ceil(4 / 3 * max(along_px, 2.0 * across_px))))
     envelope = np.exp(-(across**2) / (2 * across_px**2) - along**2 / (2 * along_px**2))
     even = envelope * (1 - across**2 / across_px**2) / across_px**2
     even -= even.mean(axis=(1, 2), keepdims=True)
@@ -270,8 +283,9 @@ def _finer(plane, y, x, bank, best):
         elif right > middle:
             best = (best + 1) % bins
             left, middle, right = middle, right, _answer(plane, y, x, bank[(best + 1) % bins])
-    bend = left - 2 * middle + right
-    return best, np.float32(0.5) * (left - right) / bend if bend < 0 else np.float32(0)
+    if middle <= left or middle <= right:  # still climbing
+        return best, np.float32(0)
+    return best, np.float32(0.5) * (left - right) / (left - 2 * middle + right)
 
 
 @njit(cache=True, fastmath=True, nogil=True)
@@ -326,3 +340,68 @@ def _hysteresis(strength, low, high):
                         stack[top] = j * width + i
                         top += 1
     return keep
+
+
+@njit(cache=True, nogil=True)
+def _runs(strength, angle, shift, low, high, length):
+    """Pixels >= low on a run of ``length`` whose mean strength is >= high: (H, W) bool. A run that ends early counts 0 for
+    what it lacks; each pixel of it continues the one before, as ``_links`` tells."""
+    rows, cols = np.nonzero(strength >= low)
+    along_u, along_v = np.empty(len(rows), np.float32), np.empty(len(rows), np.float32)
+    for i in range(len(rows)):
+        phi = angle[rows[i], cols[i]]
+        along_u[i], along_v[i] = np.cos(phi), np.sin(phi)
+    links = _links(strength, shift, rows, cols, along_u, along_v)
+    keep = np.zeros(strength.shape, np.bool_)
+    run = np.empty(length, np.int64)
+    for start in range(len(rows)):
+        for side in range(2):
+            i, ahead, count, total = start, side, 0, 0.0
+            while True:
+                run[count] = i
+                total += strength[rows[i], cols[i]]
+                count += 1
+                following = links[i, ahead]
+                if count == length or following < 0:
+                    break
+                if along_u[i] * along_u[following] + along_v[i] * along_v[following] < 0:  # told the other way round
+                    ahead = 1 - ahead
+                i = following
+            if total >= high * length:
+                for i in run[:count]:
+                    keep[rows[i], cols[i]] = True
+    return keep
+
+
+@njit(cache=True, nogil=True)
+def _links(strength, shift, rows, cols, along_u, along_v):
+    """For each ridge pixel (n,) the one that continues it along its angle and the one against it: (n, 2), -1 where none does.
+
+    Of the eight neighbours, the strongest whose crest lies ahead, turned by no more than TURN_DEG, where neither lies
+    farther than BESIDE_PX beside the line through the other; the nearer to that line, the better.
+    """
+    height, width = strength.shape
+    number = np.full((height, width), -1, np.int32)
+    links = np.full((len(rows), 2), -1, np.int32)
+    least = np.cos(np.radians(TURN_DEG))
+    for i in range(len(rows)):
+        number[rows[i], cols[i]] = i
+    for i in range(len(rows)):
+        y, x = rows[i], cols[i]
+        best = np.zeros(2, np.float32)
+        for j in range(max(y - 1, 0), min(y + 2, height)):
+            for k in range(max(x - 1, 0), min(x + 2, width)):
+                other = number[j, k]
+                if other < 0 or other == i or abs(along_u[i] * along_u[other] + along_v[i] * along_v[other]) < least:
+                    continue
+                u = k - x - shift[j, k] * along_v[other] + shift[y, x] * along_v[i]  # from crest to crest
+                v = y - j + shift[j, k] * along_u[other] - shift[y, x] * along_u[i]
+                ahead = u * along_u[i] + v * along_v[i]
+                beside = max(abs(v * along_u[i] - u * along_v[i]), abs(v * along_u[other] - u * along_v[other]))
+                if abs(ahead) < 0.5 or beside > BESIDE_PX:
+                    continue
+                side = 0 if ahead > 0 else 1
+                worth = strength[j, k] * (1 - 0.5 * beside / BESIDE_PX)
+                if worth > best[side]:
+                    best[side], links[i, side] = worth, other
+    return links
