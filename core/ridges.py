@@ -28,6 +28,7 @@ BINS = 32  # orientations of a bank, over 180 degrees
 LIGHT_PX = 8.0  # sigma of the Gaussian that tells the light around a pixel
 LIGHT_TO_OFFSET = 1.2  # c of the oriented operator, in parts of the light around clear hairs
 GRAIN_TO_OFFSET = 60.0  # and in standard deviations of the grain
+TURNED_LOSS = 0.5  # answer of a long filter that is a bin or two off, in parts of the right one's
 BESIDE_PX, TURN_DEG = 0.8, 20.0  # how far the next pixel of a run may lie beside the way of one, and be turned
 
 
@@ -36,13 +37,14 @@ class RidgeParams:
     """What counts as a ridge. Lengths in pixels of the channel plane, light in parts of white."""
 
     operator: str = "oriented"  # or "paper"
-    low: float = 0.02  # strength of a ridge pixel that may be part of a run (paper: that continues a ridge)
-    high: float = 0.035  # mean strength of a run (paper: strength that begins a ridge)
+    low: float = 0.016  # strength of a ridge pixel that may be part of a run (paper: that continues a ridge)
+    high: float = 0.033  # mean strength of a run (paper: strength that begins a ridge)
     run_px: int = 7  # oriented: ridge pixels in a run
     offset: float | None = None  # c: light added to the denominator, so that grain in the dark makes no ridges; None: estimated
     blur_px: float = 1.0  # paper: sigma of the Gaussian before all else
     across_px: float = 0.6  # oriented: sigma of the line filter across the hair
-    along_px: float = 6.0  # oriented: sigma of the line filter along the hair, which ends at 4/3 of it
+    seek_px: float = 3.0  # oriented: sigma along the hair of the line filter that seeks crests, at every pixel and angle
+    along_px: float = 6.0  # oriented: sigma along the hair of those that tell a crest's strength and angle
     turn_px: float = 0.9  # oriented: sigma across of the filter that measures the angle; a narrow one misjudges upright hair
 
 
@@ -124,10 +126,11 @@ def _measure_alone(plane, params):
         blurred = ndimage.gaussian_filter(plane, params.blur_px, truncate=4.0)
         bank = gabor_bank()
         return _relative_peaks(blurred, _folded(bank), bank.shape[1] // 2, np.float32(params.offset), np.float32(params.low))
-    even, odd = line_banks(params.across_px, params.along_px)
-    wide, _ = line_banks(params.turn_px, params.along_px)
+    even, odd = line_banks(params.across_px, params.seek_px)
+    narrow, wide = (line_banks(across_px, params.along_px)[0] for across_px in (params.across_px, params.turn_px))
     light = ndimage.gaussian_filter(plane, LIGHT_PX)
-    return _line_peaks(plane, _folded(even), odd, wide, light, np.float32(params.offset), np.float32(params.low))
+    light_and_least = light, np.float32(params.offset), np.float32(params.low)
+    return _line_peaks(plane, _folded(even), odd, _folded(narrow), _folded(wide), narrow.shape[1] // 2, *light_and_least)
 
 
 # ---- banks -----------------------------------------------------------------------------------------------------------
@@ -158,7 +161,7 @@ def line_banks(across_px: float, along_px: float) -> tuple[np.ndarray, np.ndarra
     Two arrays (32, k, k) float32. The even one is zero-mean and scaled so that a line of that very profile and height 1
     gives 1; the odd one shares the scale, so odd / even is the way to the crest in pixels (Steger 1998, sec. 2).
     """
-    across, along = _rotated_grid(int(np.ceil(4 / 3 * max(along_px, 2.0 * across_px))))
+    across, along = _rotated_grid(int(np.ceil(1.5 * max(along_px, 2.0 * across_px))))
     envelope = np.exp(-(across**2) / (2 * across_px**2) - along**2 / (2 * along_px**2))
     even = envelope * (1 - across**2 / across_px**2) / across_px**2
     even -= even.mean(axis=(1, 2), keepdims=True)
@@ -171,7 +174,8 @@ def line_banks(across_px: float, along_px: float) -> tuple[np.ndarray, np.ndarra
 #
 # A bank of even filters is one matrix product a row: the pixels at +(j, i) and -(j, i) are added first, which halves the
 # work, and the (B, (k k + 1) / 2) filters times the (…, W) sums run at the speed of sgemm: 2 B (k k + 1) / 2 flops a pixel,
-# 5440 for 32 filters 13x13. That is the bound of this stage; reading the photograph is a hundredth of it.
+# 3904 for 32 filters 11x11. That is the bound of this stage; reading the photograph is a hundredth of it. The long filters
+# work on crests alone, some tenth of the pixels: a folded patch once, then some five products with it.
 
 
 def _folded(bank: np.ndarray) -> np.ndarray:
@@ -268,48 +272,77 @@ def _answer(plane, y, x, weights):
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _finer(plane, y, x, bank, best):
-    """(bin, fraction of a bin) of the strongest filter of a bank (B, k, k), climbing from bin ``best``, by a parabola."""
+def _fold_patch(image, y, x, half, patch):
+    """patch[t] = pixel t of the k x k patch around a pixel, k = 2 half + 1, plus the one opposite; the centre last."""
+    size = 2 * half + 1
+    for j in range(half):
+        a, b = image[y - half + j, x - half : x + half + 1], image[y + half - j, x - half : x + half + 1]
+        for i in range(size):
+            patch[j * size + i] = a[i] + b[size - 1 - i]
+    for i in range(half):
+        patch[half * size + i] = image[y, x - half + i] + image[y, x + half - i]
+    patch[half * size + half] = image[y, x]
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _dot(a, b):
+    total = np.float32(0)
+    for t in range(len(a)):
+        total += a[t] * b[t]
+    return total
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _finer(patch, bank, best):
+    """(bin, fraction of a bin) of the strongest of folded filters (B, n) on a folded patch (n,), climbing from bin ``best``,
+    by a parabola."""
     bins = len(bank)
-    left, middle, right = (
-        _answer(plane, y, x, bank[(best - 1) % bins]),
-        _answer(plane, y, x, bank[best]),
-        _answer(plane, y, x, bank[(best + 1) % bins]),
-    )
+    left, middle, right = _dot(patch, bank[(best - 1) % bins]), _dot(patch, bank[best]), _dot(patch, bank[(best + 1) % bins])
     for _ in range(4):
         if left > middle and left >= right:
             best = (best - 1) % bins
-            left, middle, right = _answer(plane, y, x, bank[(best - 1) % bins]), left, middle
+            left, middle, right = _dot(patch, bank[(best - 1) % bins]), left, middle
         elif right > middle:
             best = (best + 1) % bins
-            left, middle, right = middle, right, _answer(plane, y, x, bank[(best + 1) % bins])
+            left, middle, right = middle, right, _dot(patch, bank[(best + 1) % bins])
     if middle <= left or middle <= right:  # still climbing
         return best, np.float32(0)
     return best, np.float32(0.5) * (left - right) / (left - 2 * middle + right)
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _line_peaks(plane, filters, odd, wide, light, offset, low):
-    """Crests of the line filters' response over (offset + light), their angle and shift; three (H, W) arrays."""
+def _line_peaks(plane, filters, odd, narrow, wide, rim, light, offset, low):
+    """Crests of the line filters' response over (offset + light), their angle and shift; three (H, W) arrays.
+
+    A short filter seeks them everywhere; where there is one, long filters tell its strength (``narrow``) and angle (``wide``).
+    All banks but ``odd`` are folded; rim is half the width of the long ones.
+    """
     height, width = plane.shape
-    size = odd.shape[1]
-    half = size // 2
+    half = odd.shape[1] // 2
     strength = np.zeros((height, width), np.float32)
     angle, shift = np.zeros_like(strength), np.zeros_like(strength)
     sums = np.empty((filters.shape[1], width - 2 * half), np.float32)
     values = np.empty((filters.shape[0], width - 2 * half), np.float32)
-    for y in range(half, height - half):
+    patch = np.empty(narrow.shape[1], np.float32)
+    for y in range(rim, height - rim):
         _fold_row(plane, y, half, sums)
         np.dot(filters, sums, values)
-        for x in range(half, width - half):
+        for x in range(rim, width - rim):
             best, _, value = _strongest(values, x - half)
-            if value < low * (offset + light[y, x]):
+            least = low * (offset + light[y, x])
+            if value < least:
                 continue
             step = _answer(plane, y, x, odd[best]) / value
             phi = best * np.pi / filters.shape[0]
             if abs(step) * max(abs(np.sin(phi)), abs(np.cos(phi))) > 0.6:  # the crest belongs to another pixel
                 continue
-            turned, fraction = _finer(plane, y, x, wide, best)
+            _fold_patch(plane, y, x, rim, patch)
+            if _dot(patch, narrow[best]) < TURNED_LOSS * least:
+                continue
+            turned, fraction = _finer(patch, wide, best)
+            value = _dot(patch, narrow[turned])
+            if value < least:
+                continue
             angle[y, x], _ = _turned(turned, fraction, filters.shape[0])
             # the way to the crest along the normal of the bin, told along that of the angle
             strength[y, x] = value / (offset + light[y, x])
