@@ -27,7 +27,8 @@ from threadpoolctl import ThreadpoolController
 BINS = 32  # orientations of a bank, over 180 degrees
 LIGHT_PX = 8.0  # sigma of the Gaussian that tells the light around a pixel
 LIGHT_TO_OFFSET = 1.2  # c of the oriented operator, in parts of the light around clear hairs
-GRAIN_TO_OFFSET = 60.0  # and in standard deviations of the grain
+GRAIN_TO_OFFSET = 50.0  # and in standard deviations of the grain
+BRIGHT = 0.6  # of the light of a photograph's brightest places: where its grain is measured
 TURNED_LOSS = 0.5  # answer of a long filter that is a bin or two off, in parts of the right one's
 BESIDE_PX, TURN_DEG = 0.8, 20.0  # how far the next pixel of a run may lie beside the way of one, and be turned
 
@@ -62,23 +63,26 @@ def estimate(planes: Sequence[np.ndarray], params: RidgeParams) -> RidgeParams:
     """``params`` with the offset c that suits a capture: in proportion to the light around its clearest hairs, and to the
     grain of its photographs.
 
-    planes: some photographs' channel planes (H, W). A capture twice as bright gives the same ridges. The factors are those
-    of the best trade of found and false ridges on two dense locks, one with seventeen times the grain of the other.
+    planes: some photographs' channel planes (H, W). A capture twice as bright gives the same ridges. Grain is that of bright
+    places: it grows with light, and there may be much background. The factors are those that leave one false ridge in 10,000
+    pixels of blurred hair on two dense locks, one with six times the grain of the other.
     """
-    light, grain = [], []
+    light, top = [], []
     for plane in planes:
-        around = ndimage.gaussian_filter(plane, LIGHT_PX)
         strength, _, _ = _measure(plane, replace(params, offset=float(plane.mean())))
+        around = ndimage.gaussian_filter(plane, LIGHT_PX)
         light.append(around[strength >= np.quantile(strength, 0.995)])
-        grain.append(noise(plane))
+        top.append(np.quantile(around, 0.99))
+    grain = [noise(plane, plane_top) for plane, plane_top in zip(planes, top, strict=True) if plane_top >= BRIGHT * max(top)]
     return replace(params, offset=float(LIGHT_TO_OFFSET * np.median(np.concatenate(light)) + GRAIN_TO_OFFSET * np.median(grain)))
 
 
-def noise(plane: np.ndarray) -> float:
-    """Standard deviation of the grain of a plane (H, W), from the median size of what a smooth surface has not: its mixed
-    second difference (Immerkaer 1996)."""
+def noise(plane: np.ndarray, top: float) -> float:
+    """Standard deviation of the grain of a plane (H, W) where it is bright, ``top`` being the light of its brightest places:
+    from the median size of what a smooth surface has not, its mixed second difference (Immerkaer 1996)."""
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]]) / 6.0
-    return float(1.4826 * np.median(np.abs(ndimage.convolve(plane, mask))))
+    bright = ndimage.gaussian_filter(plane, LIGHT_PX) >= BRIGHT * top
+    return float(1.4826 * np.median(np.abs(ndimage.convolve(plane, mask))[bright]))
 
 
 def detect(plane: np.ndarray, params: RidgeParams) -> Ridges:
