@@ -26,7 +26,7 @@ from threadpoolctl import ThreadpoolController
 
 BINS = 32  # orientations of a bank, over 180 degrees
 LIGHT_PX = 8.0  # sigma of the Gaussian that tells the light around a pixel
-LIGHT_TO_OFFSET = 1.2  # c of the oriented operator, in parts of the light around clear hairs
+LIGHT_TO_OFFSET = 2.0  # c of the oriented operator, in parts of the light around clear hairs
 GRAIN_TO_OFFSET = 50.0  # and in standard deviations of the grain
 BRIGHT = 0.6  # of the light of a photograph's brightest places: where its grain is measured
 TURNED_LOSS = 0.5  # answer of a long filter that is a bin or two off, in parts of the right one's
@@ -38,8 +38,8 @@ class RidgeParams:
     """What counts as a ridge. Lengths in pixels of the channel plane, light in parts of white."""
 
     operator: str = "oriented"  # or "paper"
-    low: float = 0.016  # strength of a ridge pixel that may be part of a run (paper: that continues a ridge)
-    high: float = 0.033  # mean strength of a run (paper: strength that begins a ridge)
+    low: float = 0.0145  # strength of a ridge pixel that may be part of a run (paper: that continues a ridge)
+    high: float = 0.03  # mean strength of a run (paper: strength that begins a ridge)
     run_px: int = 7  # oriented: ridge pixels in a run
     offset: float | None = None  # c: light added to the denominator, so that grain in the dark makes no ridges; None: estimated
     blur_px: float = 1.0  # paper: sigma of the Gaussian before all else
@@ -64,7 +64,7 @@ def estimate(planes: Sequence[np.ndarray], params: RidgeParams) -> RidgeParams:
     grain of its photographs.
 
     planes: some photographs' channel planes (H, W). A capture twice as bright gives the same ridges. Grain is that of bright
-    places: it grows with light, and there may be much background. The factors are those that leave one false ridge in 10,000
+    places: it grows with light, and there may be much background. The factors are those that leave less than one false ridge in 10,000
     pixels of blurred hair on two dense locks, one with six times the grain of the other.
     """
     light, top = [], []
