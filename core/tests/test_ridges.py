@@ -43,7 +43,7 @@ def far_from_the_rim(ridges, angle, through, reach=18):
 
 # ---- where and how -----------------------------------------------------------------------------------------------------
 
-# Mean distance (px) from the line, and mean turn (degrees): measured 0.02 to 0.03 and 0.5 (oriented), 0.04 and 0.35 (paper).
+# Mean distance (px) from the line, and mean turn (degrees): measured 0.02 to 0.03 and 0.2 (oriented), 0.04 and 0.35 (paper).
 # What remains is grain, 2 % of the hair's light here, and that the peak between bins is no parabola. Half a pixel would be 0.3.
 PLACE_PX = {"oriented": 0.05, "paper": 0.07}
 TURN_DEG = 1.0
@@ -260,7 +260,7 @@ def test_blurred_hair_makes_no_ridges(grain):
     assert count < 48
 
 
-# Measured: 0.04 px and 0.1 to 0.4 degrees with the grain of a sensor; 0.09 px and 0.9 degrees with that of a tenth.
+# Measured: 0.02 to 0.04 px and 0.1 to 0.3 degrees with the grain of a sensor; 0.05 to 0.08 px and 0.2 to 0.7 with a tenth.
 @pytest.mark.parametrize("width_px", [1.5, 2.8, 4.0])
 @pytest.mark.parametrize("grain", ["sensor", "tenth"])
 def test_hair_in_focus_is_found_to_a_tenth_of_a_pixel_and_a_degree(grain, width_px):
