@@ -6,7 +6,10 @@ Two operators give the same records:
               photograph across that orientation, its relative height M' = (M - Mmax) / (Mmax + c), hysteresis.
 ``oriented``  Ours: a bank of line filters, narrow across the hair and long along it, and the maximum and the thresholds are
               those of the filter's own response, over the light around it. Clutter from the hairs beside and behind limits
-              detection, and a long filter averages it away.
+              detection in photographs of little grain, and a narrow filter keeps it out; a long one averages grain away.
+              What is kept are runs: ridge pixels each of which continues the one before in place and angle, and whose
+              mean strength over the length of the run is enough. Grain and rungs between hairs are strong only shortly;
+              half hidden hair is weak for a long way.
 
 Both give the position along the normal and the angle between the bins of the bank. Angles are those of the hair in the
 image, from +u (right) towards +v (up), in [0, pi).
@@ -22,8 +25,12 @@ from scipy import ndimage
 from threadpoolctl import ThreadpoolController
 
 BINS = 32  # orientations of a bank, over 180 degrees
-LIGHT_TO_OFFSET = 1.2  # c of the oriented operator, in parts of the light around clear hairs
-GRAIN_TO_OFFSET = 12.0  # and in standard deviations of the grain
+LIGHT_PX = 8.0  # sigma of the Gaussian that tells the light around a pixel
+LIGHT_TO_OFFSET = 2.0  # c of the oriented operator, in parts of the light around clear hairs
+GRAIN_TO_OFFSET = 50.0  # and in standard deviations of the grain
+BRIGHT = 0.6  # of the light of a photograph's brightest places: where its grain is measured
+TURNED_LOSS = 0.5  # answer of a long filter that is a bin or two off, in parts of the right one's
+BESIDE_PX, TURN_DEG = 0.8, 20.0  # how far the next pixel of a run may lie beside the way of one, and be turned
 
 
 @dataclass(frozen=True)
@@ -31,12 +38,14 @@ class RidgeParams:
     """What counts as a ridge. Lengths in pixels of the channel plane, light in parts of white."""
 
     operator: str = "oriented"  # or "paper"
-    low: float = 0.05  # hysteresis: strength that continues a ridge
-    high: float = 0.12  # hysteresis: strength that begins one
+    low: float = 0.017  # strength of a ridge pixel that may be part of a run (paper: that continues a ridge)
+    high: float = 0.03  # mean strength of a run (paper: strength that begins a ridge)
+    run_px: int = 7  # oriented: ridge pixels in a run
     offset: float | None = None  # c: light added to the denominator, so that grain in the dark makes no ridges; None: estimated
     blur_px: float = 1.0  # paper: sigma of the Gaussian before all else
-    across_px: float = 0.7  # oriented: sigma of the line filter across the hair
-    along_px: float = 4.0  # oriented: sigma of the line filter along the hair
+    across_px: float = 0.6  # oriented: sigma of the line filter across the hair
+    seek_px: float = 3.0  # oriented: sigma along the hair of the line filter that seeks crests, at every pixel and angle
+    along_px: float = 6.0  # oriented: sigma along the hair of those that tell a crest's strength and angle
     turn_px: float = 0.9  # oriented: sigma across of the filter that measures the angle; a narrow one misjudges upright hair
 
 
@@ -54,23 +63,26 @@ def estimate(planes: Sequence[np.ndarray], params: RidgeParams) -> RidgeParams:
     """``params`` with the offset c that suits a capture: in proportion to the light around its clearest hairs, and to the
     grain of its photographs.
 
-    planes: some photographs' channel planes (H, W). A capture twice as bright gives the same ridges. The factors are those
-    of the best trade of found and false ridges on two dense locks, one with seventeen times the grain of the other.
+    planes: some photographs' channel planes (H, W). A capture twice as bright gives the same ridges. Grain is that of bright
+    places: it grows with light, and there may be much background. The factors are those that leave less than one false ridge in 10,000
+    pixels of blurred hair on two dense locks, one with six times the grain of the other.
     """
-    light, grain = [], []
+    light, top = [], []
     for plane in planes:
-        around = ndimage.gaussian_filter(plane, 2.0 * params.along_px)
         strength, _, _ = _measure(plane, replace(params, offset=float(plane.mean())))
+        around = ndimage.gaussian_filter(plane, LIGHT_PX)
         light.append(around[strength >= np.quantile(strength, 0.995)])
-        grain.append(noise(plane))
+        top.append(np.quantile(around, 0.99))
+    grain = [noise(plane, plane_top) for plane, plane_top in zip(planes, top, strict=True) if plane_top >= BRIGHT * max(top)]
     return replace(params, offset=float(LIGHT_TO_OFFSET * np.median(np.concatenate(light)) + GRAIN_TO_OFFSET * np.median(grain)))
 
 
-def noise(plane: np.ndarray) -> float:
-    """Standard deviation of the grain of a plane (H, W), from the median size of what a smooth surface has not: its mixed
-    second difference (Immerkaer 1996)."""
+def noise(plane: np.ndarray, top: float) -> float:
+    """Standard deviation of the grain of a plane (H, W) where it is bright, ``top`` being the light of its brightest places:
+    from the median size of what a smooth surface has not, its mixed second difference (Immerkaer 1996)."""
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]]) / 6.0
-    return float(1.4826 * np.median(np.abs(ndimage.convolve(plane, mask))))
+    bright = ndimage.gaussian_filter(plane, LIGHT_PX) >= BRIGHT * top
+    return float(1.4826 * np.median(np.abs(ndimage.convolve(plane, mask))[bright]))
 
 
 def detect(plane: np.ndarray, params: RidgeParams) -> Ridges:
@@ -79,7 +91,7 @@ def detect(plane: np.ndarray, params: RidgeParams) -> Ridges:
     Each is one pixel wide; col and row are moved along the normal to the crest.
     """
     strength, angle, shift = _measure(plane, params)
-    rows, cols = np.nonzero(_hysteresis(strength, params.low, params.high))
+    rows, cols = np.nonzero(_kept(strength, angle, shift, params))
     angle, shift = angle[rows, cols], shift[rows, cols]
     # the normal of a hair at `angle` is (-sin, cos) in (u, v); rows run down, v runs up
     col, row = cols - shift * np.sin(angle), rows - shift * np.cos(angle)
@@ -88,8 +100,15 @@ def detect(plane: np.ndarray, params: RidgeParams) -> Ridges:
 
 def response(plane: np.ndarray, params: RidgeParams) -> np.ndarray:
     """Strength (H, W) float32 of the ridge at each pixel of a channel plane (H, W), 0 where there is none; for pictures."""
-    strength, _, _ = _measure(plane, params)
-    return np.where(_hysteresis(strength, params.low, params.high), strength, 0).astype(np.float32)
+    strength, angle, shift = _measure(plane, params)
+    return np.where(_kept(strength, angle, shift, params), strength, 0).astype(np.float32)
+
+
+def _kept(strength, angle, shift, params):
+    """Which crests (H, W) are ridges, bool."""
+    if params.operator == "paper":
+        return _hysteresis(strength, params.low, params.high)
+    return _runs(strength, angle, shift, params.low, params.high, params.run_px)
 
 
 def _measure(plane, params):
@@ -111,10 +130,11 @@ def _measure_alone(plane, params):
         blurred = ndimage.gaussian_filter(plane, params.blur_px, truncate=4.0)
         bank = gabor_bank()
         return _relative_peaks(blurred, _folded(bank), bank.shape[1] // 2, np.float32(params.offset), np.float32(params.low))
-    even, odd = line_banks(params.across_px, params.along_px)
-    wide, _ = line_banks(params.turn_px, params.along_px)
-    light = ndimage.gaussian_filter(plane, 2.0 * params.along_px)
-    return _line_peaks(plane, _folded(even), odd, wide, light, np.float32(params.offset), np.float32(params.low))
+    even, odd = line_banks(params.across_px, params.seek_px)
+    narrow, wide = (line_banks(across_px, params.along_px)[0] for across_px in (params.across_px, params.turn_px))
+    light = ndimage.gaussian_filter(plane, LIGHT_PX)
+    light_and_least = light, np.float32(params.offset), np.float32(params.low)
+    return _line_peaks(plane, _folded(even), odd, _folded(narrow), _folded(wide), narrow.shape[1] // 2, *light_and_least)
 
 
 # ---- banks -----------------------------------------------------------------------------------------------------------
@@ -145,7 +165,7 @@ def line_banks(across_px: float, along_px: float) -> tuple[np.ndarray, np.ndarra
     Two arrays (32, k, k) float32. The even one is zero-mean and scaled so that a line of that very profile and height 1
     gives 1; the odd one shares the scale, so odd / even is the way to the crest in pixels (Steger 1998, sec. 2).
     """
-    across, along = _rotated_grid(int(np.ceil(2.0 * max(along_px, 1.5 * across_px))))
+    across, along = _rotated_grid(int(np.ceil(1.5 * max(along_px, 2.0 * across_px))))
     envelope = np.exp(-(across**2) / (2 * across_px**2) - along**2 / (2 * along_px**2))
     even = envelope * (1 - across**2 / across_px**2) / across_px**2
     even -= even.mean(axis=(1, 2), keepdims=True)
@@ -158,7 +178,8 @@ def line_banks(across_px: float, along_px: float) -> tuple[np.ndarray, np.ndarra
 #
 # A bank of even filters is one matrix product a row: the pixels at +(j, i) and -(j, i) are added first, which halves the
 # work, and the (B, (k k + 1) / 2) filters times the (…, W) sums run at the speed of sgemm: 2 B (k k + 1) / 2 flops a pixel,
-# 5440 for 32 filters 13x13. That is the bound of this stage; reading the photograph is a hundredth of it.
+# 3904 for 32 filters 11x11. That is the bound of this stage; reading the photograph is a hundredth of it. The long filters
+# work on crests alone, some tenth of the pixels: a folded patch once, then some five products with it.
 
 
 def _folded(bank: np.ndarray) -> np.ndarray:
@@ -255,47 +276,77 @@ def _answer(plane, y, x, weights):
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _finer(plane, y, x, bank, best):
-    """(bin, fraction of a bin) of the strongest filter of a bank (B, k, k), climbing from bin ``best``, by a parabola."""
-    bins = len(bank)
-    left, middle, right = (
-        _answer(plane, y, x, bank[(best - 1) % bins]),
-        _answer(plane, y, x, bank[best]),
-        _answer(plane, y, x, bank[(best + 1) % bins]),
-    )
-    for _ in range(4):
-        if left > middle and left >= right:
-            best = (best - 1) % bins
-            left, middle, right = _answer(plane, y, x, bank[(best - 1) % bins]), left, middle
-        elif right > middle:
-            best = (best + 1) % bins
-            left, middle, right = middle, right, _answer(plane, y, x, bank[(best + 1) % bins])
-    bend = left - 2 * middle + right
-    return best, np.float32(0.5) * (left - right) / bend if bend < 0 else np.float32(0)
+def _fold_patch(image, y, x, half, patch):
+    """patch[t] = pixel t of the k x k patch around a pixel, k = 2 half + 1, plus the one opposite; the centre last."""
+    size = 2 * half + 1
+    for j in range(half):
+        a, b = image[y - half + j, x - half : x + half + 1], image[y + half - j, x - half : x + half + 1]
+        for i in range(size):
+            patch[j * size + i] = a[i] + b[size - 1 - i]
+    for i in range(half):
+        patch[half * size + i] = image[y, x - half + i] + image[y, x + half - i]
+    patch[half * size + half] = image[y, x]
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _line_peaks(plane, filters, odd, wide, light, offset, low):
-    """Crests of the line filters' response over (offset + light), their angle and shift; three (H, W) arrays."""
+def _dot(a, b):
+    total = np.float32(0)
+    for t in range(len(a)):
+        total += a[t] * b[t]
+    return total
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _finer(patch, bank, best):
+    """(bin, fraction of a bin) of the strongest of folded filters (B, n) on a folded patch (n,), climbing from bin ``best``,
+    by a parabola."""
+    bins = len(bank)
+    left, middle, right = _dot(patch, bank[(best - 1) % bins]), _dot(patch, bank[best]), _dot(patch, bank[(best + 1) % bins])
+    for _ in range(4):
+        if left > middle and left >= right:
+            best = (best - 1) % bins
+            left, middle, right = _dot(patch, bank[(best - 1) % bins]), left, middle
+        elif right > middle:
+            best = (best + 1) % bins
+            left, middle, right = middle, right, _dot(patch, bank[(best + 1) % bins])
+    if middle <= left or middle <= right:  # still climbing
+        return best, np.float32(0)
+    return best, np.float32(0.5) * (left - right) / (left - 2 * middle + right)
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _line_peaks(plane, filters, odd, narrow, wide, rim, light, offset, low):
+    """Crests of the line filters' response over (offset + light), their angle and shift; three (H, W) arrays.
+
+    A short filter seeks them everywhere; where there is one, long filters tell its strength (``narrow``) and angle (``wide``).
+    All banks but ``odd`` are folded; rim is half the width of the long ones.
+    """
     height, width = plane.shape
-    size = odd.shape[1]
-    half = size // 2
+    half = odd.shape[1] // 2
     strength = np.zeros((height, width), np.float32)
     angle, shift = np.zeros_like(strength), np.zeros_like(strength)
     sums = np.empty((filters.shape[1], width - 2 * half), np.float32)
     values = np.empty((filters.shape[0], width - 2 * half), np.float32)
-    for y in range(half, height - half):
+    patch = np.empty(narrow.shape[1], np.float32)
+    for y in range(rim, height - rim):
         _fold_row(plane, y, half, sums)
         np.dot(filters, sums, values)
-        for x in range(half, width - half):
+        for x in range(rim, width - rim):
             best, _, value = _strongest(values, x - half)
-            if value < low * (offset + light[y, x]):
+            least = low * (offset + light[y, x])
+            if value < least:
                 continue
             step = _answer(plane, y, x, odd[best]) / value
             phi = best * np.pi / filters.shape[0]
             if abs(step) * max(abs(np.sin(phi)), abs(np.cos(phi))) > 0.6:  # the crest belongs to another pixel
                 continue
-            turned, fraction = _finer(plane, y, x, wide, best)
+            _fold_patch(plane, y, x, rim, patch)
+            if _dot(patch, narrow[best]) < TURNED_LOSS * least:
+                continue
+            turned, fraction = _finer(patch, wide, best)
+            value = _dot(patch, narrow[turned])
+            if value < least:
+                continue
             angle[y, x], _ = _turned(turned, fraction, filters.shape[0])
             # the way to the crest along the normal of the bin, told along that of the angle
             strength[y, x] = value / (offset + light[y, x])
@@ -326,3 +377,68 @@ def _hysteresis(strength, low, high):
                         stack[top] = j * width + i
                         top += 1
     return keep
+
+
+@njit(cache=True, nogil=True)
+def _runs(strength, angle, shift, low, high, length):
+    """Pixels >= low on a run of ``length`` whose mean strength is >= high: (H, W) bool. A run that ends early counts 0 for
+    what it lacks; each pixel of it continues the one before, as ``_links`` tells."""
+    rows, cols = np.nonzero(strength >= low)
+    along_u, along_v = np.empty(len(rows), np.float32), np.empty(len(rows), np.float32)
+    for i in range(len(rows)):
+        phi = angle[rows[i], cols[i]]
+        along_u[i], along_v[i] = np.cos(phi), np.sin(phi)
+    links = _links(strength, shift, rows, cols, along_u, along_v)
+    keep = np.zeros(strength.shape, np.bool_)
+    run = np.empty(length, np.int64)
+    for start in range(len(rows)):
+        for side in range(2):
+            i, ahead, count, total = start, side, 0, 0.0
+            while True:
+                run[count] = i
+                total += strength[rows[i], cols[i]]
+                count += 1
+                following = links[i, ahead]
+                if count == length or following < 0:
+                    break
+                if along_u[i] * along_u[following] + along_v[i] * along_v[following] < 0:  # told the other way round
+                    ahead = 1 - ahead
+                i = following
+            if total >= high * length:
+                for i in run[:count]:
+                    keep[rows[i], cols[i]] = True
+    return keep
+
+
+@njit(cache=True, nogil=True)
+def _links(strength, shift, rows, cols, along_u, along_v):
+    """For each ridge pixel (n,) the one that continues it along its angle and the one against it: (n, 2), -1 where none does.
+
+    Of the eight neighbours, the strongest whose crest lies ahead, turned by no more than TURN_DEG, where neither lies
+    farther than BESIDE_PX beside the line through the other; the nearer to that line, the better.
+    """
+    height, width = strength.shape
+    number = np.full((height, width), -1, np.int32)
+    links = np.full((len(rows), 2), -1, np.int32)
+    least = np.cos(np.radians(TURN_DEG))
+    for i in range(len(rows)):
+        number[rows[i], cols[i]] = i
+    for i in range(len(rows)):
+        y, x = rows[i], cols[i]
+        best = np.zeros(2, np.float32)
+        for j in range(max(y - 1, 0), min(y + 2, height)):
+            for k in range(max(x - 1, 0), min(x + 2, width)):
+                other = number[j, k]
+                if other < 0 or other == i or abs(along_u[i] * along_u[other] + along_v[i] * along_v[other]) < least:
+                    continue
+                u = k - x - shift[j, k] * along_v[other] + shift[y, x] * along_v[i]  # from crest to crest
+                v = y - j + shift[j, k] * along_u[other] - shift[y, x] * along_u[i]
+                ahead = u * along_u[i] + v * along_v[i]
+                beside = max(abs(v * along_u[i] - u * along_v[i]), abs(v * along_u[other] - u * along_v[other]))
+                if abs(ahead) < 0.5 or beside > BESIDE_PX:
+                    continue
+                side = 0 if ahead > 0 else 1
+                worth = strength[j, k] * (1 - 0.5 * beside / BESIDE_PX)
+                if worth > best[side]:
+                    best[side], links[i, side] = worth, other
+    return links
