@@ -212,7 +212,7 @@ def resolve(capture: Capture, parameters: Parameters) -> Parameters:
     if parameters.ridges.offset is not None:
         return parameters
     photographs = [(sweep, file) for sweep in capture.sweeps for file in sweep.files]
-    chosen = photographs[:: max(len(photographs) // SAMPLED_PHOTOGRAPHS, 1)]
+    chosen = [photographs[i] for i in np.linspace(0, len(photographs) - 1, SAMPLED_PHOTOGRAPHS + 2).astype(int)[1:-1]]
     return replace(parameters, ridges=estimate([capture.planes(file)[0] for _, file in chosen], parameters.ridges))
 
 
