@@ -38,8 +38,8 @@ class RidgeParams:
     """What counts as a ridge. Lengths in pixels of the channel plane, light in parts of white."""
 
     operator: str = "oriented"  # or "paper"
-    low: float = 0.017  # strength of a ridge pixel that may be part of a run (paper: that continues a ridge)
-    high: float = 0.03  # mean strength of a run (paper: strength that begins a ridge)
+    low: float = 0.011  # strength of a ridge pixel that may be part of a run (paper: that continues a ridge)
+    high: float = 0.022  # mean strength of a run (paper: strength that begins a ridge)
     run_px: int = 7  # oriented: ridge pixels in a run
     offset: float | None = None  # c: light added to the denominator, so that grain in the dark makes no ridges; None: estimated
     blur_px: float = 1.0  # paper: sigma of the Gaussian before all else
