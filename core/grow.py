@@ -62,7 +62,7 @@ class GrowParams:
     max_correction_px: float = 0.5  # gamma: largest correction in one step
     box_px: tuple[float, float, float] = (40.0, 30.0, 8.0)  # a_g, a_s, a_t: full extents along the hair, the slope, across
     min_cameras: int = 3  # m: cameras that a step needs
-    bridge_mm: float = 1.0  # how far a hair is continued where it is not observed
+    bridge_mm: float = 0.5  # how far a hair is continued where it is not observed
     min_own: float = 0.45  # share of the observations of a curve that no curve before has used up
     min_evidence: float = 2.0  # evidence that a step needs
     seed_evidence: tuple[float, float, float] = (2.2, 1.5, 1.2)  # of a seed in each pass, in parts of what a step needs

@@ -36,12 +36,13 @@ class RefineParams:
     near_mm: float = 0.6  # evidence of a point is that of this length around it
     step_evidence: tuple[float, float, float] = (2.5, 1.5, 0.8)  # evidence that a step needs in the rounds of ``trace``
     new_evidence: float = 0.4  # no new curve is begun in a round that asks for less
-    join_mm: float = 3.0  # longest gap over which two pieces are joined
+    join_cost: float = 6.0  # misfit of two ends, squared, in units of the next two
+    join_mm: float = 1.5  # longest gap over which two pieces are joined
     join_place: tuple[float, float] = (0.02, 0.02)  # mm, and mm a mm of gap: how well two ends must meet in the middle of it
     join_turn_deg: tuple[float, float] = (2.0, 4.0)  # and a mm of gap: how well their directions must agree
     same_mm: float = 0.04  # closer than this to a better curve, along it, a curve is the same hair
     min_length_mm: float = 1.5  # shorter curves are taken for chance
-    mean_evidence: tuple[float, float] = (1.1, 1.5)  # and those that have less evidence than the first, and less than this many mm of it
+    mean_evidence: tuple[float, float] = (1.1, 2.2)  # and those that have less evidence than the first, and less than this many mm of it
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def smoothed(points: np.ndarray, normal: np.ndarray, right: np.ndarray, price: f
         pull[a : n - 3 + a] -= price * third[a] * jump
         for b in range(a, 4):
             bands[9 - 3 * (b - a), 3 * b : 3 * (n - 3 + b)] += price * third[a] * third[b]
-    bands[9] += 1e-9
+    bands[9] += 1e-6 + 1e-13 * price  # a hair that nothing ties is still held somewhere
     factor = cholesky_banded(bands)
     move = cho_solve_banded((factor, False), pull.reshape(-1)).reshape(n, 3)
     misfit = np.einsum("ni,nij,nj", move, normal, move) - 2 * np.sum(right * move) + price * np.sum(np.diff(points + move, 3, axis=0) ** 2)
@@ -259,12 +260,15 @@ def _fit_all(curves: list[Curve], work: _Work) -> list[Curve]:
 
 
 def _cut_all(curves: list[Curve], work: _Work) -> list[Curve]:
-    """Cut the ends back to where there is the evidence that a step needs."""
+    """Cut off ends that have less evidence than their steps need."""
     out = []
     for curve in curves:
-        good = np.flatnonzero(curve.evidence >= work.box.min_evidence)
-        if len(good) >= 4:
-            out.append(_part(curve, good[0], good[-1] + 1))
+        surplus = np.concatenate([[0.0], np.cumsum(curve.evidence - work.box.min_evidence)])
+        low = np.minimum.accumulate(surplus)
+        last = int(np.argmax(surplus - low))
+        first = int(np.argmin(surplus[: last + 1]))
+        if last - first >= 4:
+            out.append(_part(curve, first, last))
     return out
 
 
@@ -340,7 +344,7 @@ def _join(curves: list[Curve], work: _Work) -> list[Curve]:
         turned = np.degrees(np.arccos(np.clip(-way[a] @ way[b], -1, 1)))
         cost = (miss / (params.join_place[0] + params.join_place[1] * size)) ** 2
         cost += (turned / (params.join_turn_deg[0] + params.join_turn_deg[1] * size)) ** 2
-        if cost < 8:
+        if cost < params.join_cost + 4:
             found.append((cost + size, a, b, cost))
     best: dict[int, list[float]] = {}
     for _, a, b, cost in found:
@@ -349,7 +353,7 @@ def _join(curves: list[Curve], work: _Work) -> list[Curve]:
     partner: dict[int, int] = {}
     for _, a, b, cost in sorted(found):
         alone = all(sum(c < cost + 3 for c in best[e]) < 2 for e in (a, b))  # nothing else fits nearly as well
-        if cost < 4 and alone and a not in partner and b not in partner:
+        if cost < params.join_cost and alone and a not in partner and b not in partner:
             partner[a], partner[b] = b, a
     return _chains(curves, partner, work.box.step)
 
@@ -422,7 +426,8 @@ def _keep(curves: list[Curve], work: _Work) -> list[Curve]:
     ]
 
 
-STAGES = (_fit_all, _cut_all, _once, _join, _fit_all, _extend, _fit_all, _cut_all, _once, _join, _fit_all)  # of a round
+_TIDY = (_fit_all, _cut_all, _once, _join, _fit_all)
+STAGES = (*_TIDY, _extend, *_TIDY)  # of a round
 
 
 def _flat(curves: list[Curve], tried: int) -> Grown:
