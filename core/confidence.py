@@ -7,6 +7,7 @@ hair (which falls with the evidence, and is higher where hairs bend and cross).
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
@@ -17,6 +18,8 @@ from .grow import GrowParams
 from .refine import JERKS_PER_MM2, RefineParams, _tie, _work, smoothed
 
 THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
+SURE_MM = 0.02  # confidence is the chance to lie this near to a centreline
+TAIL = 1.5  # how fast the share of points falls beyond their expected error
 BEND_MM = 0.4  # to either side: the length over which curvature is measured
 
 
@@ -129,5 +132,13 @@ def expected_error(
         return combined(*known, params or ErrorParams())
 
     with ThreadPoolExecutor(workers) as pool:
-        parts = list(pool.map(one, zip(offsets[:-1], offsets[1:], strict=True)))
+        parts = list(pool.map(one, pairwise(offsets)))
     return np.concatenate([*parts, np.zeros(0)]).astype(np.float32)
+
+
+def confidence(error_mm: np.ndarray) -> np.ndarray:
+    """Confidence (N,) float32 of points with an expected error (N,) mm: the chance to lie within SURE_MM of a true centreline,
+    1 / (1 + (error / SURE_MM)^TAIL). That is 1/2 at an expected error of SURE_MM, and 0 where the error is not known (NaN).
+    """
+    chance = 1 / (1 + (np.asarray(error_mm, float) / SURE_MM) ** TAIL)
+    return np.where(np.isnan(chance), 0, chance).astype(np.float32)
