@@ -2,7 +2,7 @@
 
 Three things add up, as squares: what the fit does not know (the covariance of the smoothing spline), what it has wrong where
 hair bends (a filter that is long along a hair sees a bend from inside), and the chance that the curve follows another
-hair (which falls with the evidence, and is higher where hairs bend and cross).
+hair (which falls with the evidence, and is higher among hairs that bend and cross).
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -19,20 +19,20 @@ from .refine import JERKS_PER_MM2, RefineParams, _tie, _work, smoothed
 
 THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
 SURE_MM = 0.02  # confidence is the chance to lie this near to a centreline
-TAIL = 1.5  # how fast the share of points falls beyond their expected error
 BEND_MM = 0.4  # to either side: the length over which curvature is measured
 
 
 @dataclass(frozen=True)
 class ErrorParams:
-    """Weights of the three parts: those with the least mean |log(distance / expected error)| over three known locks."""
+    """Weights of the three parts: those that tell the distances best in three dense locks that are known, one of another
+    renderer (straight, wavy, curls): the least mean |log(distance / expected error)|, and medians that agree."""
 
-    fit: float = 0.888  # of the root of the covariance's trace across the hair
-    bend_mm2: float = 0.0094  # of the curvature (1/mm)
-    astray_mm: float = 0.0336  # of how much the lack of evidence tells, in straight hair
-    astray_mm2: float = 0.154  # and more by the curvature (1/mm)
-    least_evidence: float = 0.3  # added to the evidence
-    power: float = 1.714  # with which the last part falls with the evidence
+    fit: float = 0.80  # of the root of the covariance's trace across the hair
+    bend_mm2: float = 0.0101  # of the curvature at the point (1/mm)
+    astray_mm: float = 0.0173  # error that the lack of evidence makes in straight hair
+    astray_mm2: float = 0.224  # and, added as squares, in bent hair: of the curve's mean curvature (1/mm)
+    least_evidence: float = 0.32  # added to the evidence
+    power: float = 1.445  # of the evidence, with which these two fall
 
 
 @njit(cache=True, nogil=True)
@@ -101,8 +101,9 @@ def curvature(points: np.ndarray, half: int) -> np.ndarray:
 
 
 def combined(spread_mm: np.ndarray, curvature_per_mm: np.ndarray, evidence: np.ndarray, params: ErrorParams) -> np.ndarray:
-    """Expected error (n,) mm: the distance to the centreline that half of such points keep."""
-    astray = (params.astray_mm + params.astray_mm2 * curvature_per_mm) / (np.maximum(evidence, 0.0) + params.least_evidence) ** params.power
+    """Expected error (n,) mm of the points of one curve: the distance to the centreline that half of such points keep."""
+    astray = np.hypot(params.astray_mm, params.astray_mm2 * curvature_per_mm.mean())
+    astray = astray / (np.maximum(evidence, 0.0) + params.least_evidence) ** params.power
     return np.sqrt((params.fit * spread_mm) ** 2 + (params.bend_mm2 * curvature_per_mm) ** 2 + astray**2)
 
 
@@ -138,7 +139,10 @@ def expected_error(
 
 def confidence(error_mm: np.ndarray) -> np.ndarray:
     """Confidence (N,) float32 of points with an expected error (N,) mm: the chance to lie within SURE_MM of a true centreline,
-    1 / (1 + (error / SURE_MM)^TAIL). That is 1/2 at an expected error of SURE_MM, and 0 where the error is not known (NaN).
+    1 / (1 + (error / SURE_MM)²). That is 1/2 at an expected error of SURE_MM, and 0 where the error is not known (NaN).
+
+    On the three locks of ``ErrorParams`` 97, 88, 67 and 48 of 100 points with an expected error of 4, 7, 13 and 22 µm lay so near;
+    the formula says 96, 89, 71 and 45.
     """
-    chance = 1 / (1 + (np.asarray(error_mm, float) / SURE_MM) ** TAIL)
+    chance = 1 / (1 + (np.asarray(error_mm, float) / SURE_MM) ** 2)
     return np.where(np.isnan(chance), 0, chance).astype(np.float32)
