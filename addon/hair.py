@@ -15,6 +15,7 @@ from ..core.strands import CAPTURED, Strands, statistics
 
 METRES_PER_MM = 0.001
 PROVENANCE, STATISTICS = "strandscope_provenance", "strandscope_statistics"  # custom properties of the curves, JSON
+UNKNOWN = -1.0  # an error that is not known: shaders cannot work with NaN
 CYCLES_RADIUS = 3e-4  # in units of the scene
 SHOW = "Strandscope Show"  # modifier and node group that hide captured hair or infill
 
@@ -23,6 +24,7 @@ _ATTRIBUTES = {
     "position": ("FLOAT_VECTOR", "POINT", "vector", np.float32),
     "radius": ("FLOAT", "POINT", "value", np.float32),
     "confidence": ("FLOAT", "POINT", "value", np.float32),
+    "error": ("FLOAT", "POINT", "value", np.float32),
     "strand_id": ("INT", "CURVE", "value", np.int32),
     "kind": ("INT8", "CURVE", "value", np.int8),
     "stop_start": ("INT8", "CURVE", "value", np.int8),
@@ -46,8 +48,9 @@ def from_blender(points: np.ndarray) -> np.ndarray:
 def add_hair(strands: Strands, name: str = "Hair", collection: bpy.types.Collection | None = None) -> bpy.types.Object:
     """A new hair object with all strands, linked to ``collection`` (the scene's if None).
 
-    Poly curves with the point attributes radius (m) and confidence and the curve attributes strand_id and kind (0 captured,
-    1 infill); where the strands came from is a custom property. A modifier with two switches shows each kind or not.
+    Poly curves with the point attributes radius (m), confidence and, if it is known, error (the expected one, m; UNKNOWN for
+    infill), and the curve attributes strand_id and kind (0 captured, 1 infill); where the strands came from is a custom
+    property. A modifier with two switches shows each kind or not.
     Raises StrandscopeError if there are no strands.
     """
     if len(strands) == 0:
@@ -62,6 +65,8 @@ def add_hair(strands: Strands, name: str = "Hair", collection: bpy.types.Collect
         "strand_id": np.arange(len(strands)),
         "kind": strands.kind,
     }
+    if strands.error_mm is not None:
+        values["error"] = np.where(np.isnan(strands.error_mm), UNKNOWN, METRES_PER_MM * strands.error_mm.astype(np.float64))
     if strands.stops is not None:
         values |= dict(zip(_STOPS, strands.stops.T, strict=True))
     for attribute, each in values.items():
@@ -90,9 +95,16 @@ def strands_of(hair: bpy.types.Object) -> Strands:
         radius_mm=(_read(curves, "radius", 4e-5).astype(np.float64) / METRES_PER_MM).astype(np.float32),
         kind=_read(curves, "kind", CAPTURED).astype(np.uint8),
         confidence=_read(curves, "confidence", 1),
+        error_mm=_errors(curves) if "error" in curves.attributes else None,
         stops=np.stack([_read(curves, name) for name in _STOPS], axis=1).astype(np.uint8) if _STOPS[0] in curves.attributes else None,
         provenance=json.loads(curves.get(PROVENANCE, "{}")),
     )
+
+
+def _errors(curves: bpy.types.Curves) -> np.ndarray:
+    """Expected errors (N,) float32, mm, NaN where they are not known."""
+    error = _read(curves, "error").astype(np.float64)
+    return np.where(error < 0, np.nan, error / METRES_PER_MM).astype(np.float32)
 
 
 def is_hair(hair: bpy.types.Object | None) -> bool:

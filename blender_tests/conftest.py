@@ -46,6 +46,7 @@ def strands() -> Strands:
         kind=np.where(np.arange(9) % 3 == 2, INFILL, CAPTURED).astype(np.uint8),
         confidence=rng.uniform(0, 1, count).astype(np.float32),
         stops=rng.integers(0, 6, (9, 2)).astype(np.uint8),
+        error_mm=np.where(np.repeat(np.arange(9) % 3 == 2, sizes), np.nan, rng.uniform(0, 0.05, count)).astype(np.float32),
         provenance={"capture": "a test", "parameters": {"step_mm": 0.1}},
     )
 

@@ -30,11 +30,19 @@ def test_round_trip(strands):
         assert getattr(back, name).dtype == getattr(strands, name).dtype
     np.testing.assert_array_max_ulp(back.points_mm, strands.points_mm, maxulp=1)
     np.testing.assert_array_max_ulp(back.radius_mm, strands.radius_mm, maxulp=1)
+    np.testing.assert_allclose(back.error_mm, strands.error_mm, rtol=1e-6)
     assert back.provenance == strands.provenance
 
 
 def test_round_trip_of_strands_that_do_not_say_why_they_stopped(strands):
     assert hair.strands_of(hair.add_hair(dataclasses.replace(strands, stops=None))).stops is None
+
+
+def test_errors_that_are_not_known_are_below_zero_for_shaders(strands):
+    curves = hair.add_hair(strands).data
+    error = np.array([d.value for d in curves.attributes["error"].data])
+    np.testing.assert_array_equal(error < 0, np.isnan(strands.error_mm))
+    assert hair.strands_of(hair.add_hair(dataclasses.replace(strands, error_mm=None))).error_mm is None
 
 
 def test_attributes(strands):

@@ -23,6 +23,7 @@ SEEN_ANGLES = 4  # angles from which on a point counts as visible
 ANGLE_BINS = (0, 1, 4, 8, 12, 16)
 SIGMA_MM, SWITCH_COST = 0.04, 12.0  # of the assignment of a curve to fibers: spread of distances, price of a change
 REACH = 1.25  # fibers farther than this times the tolerance are not considered
+ERROR_EDGES_UM = tuple(round(10 ** (k / 2), 1) for k in range(5))  # bins of expected error: half decades
 ON_FIBER_MM, FOLLOWED_MM = 0.3, 0.5  # shortest run that counts as being on a fiber, and as following it
 
 SHARP_MM = 0.1  # blur, a hair's width, up to which a point counts as in focus
@@ -85,7 +86,8 @@ def score(strands: Strands, truth: Truth, tolerance_mm: float = 0.1) -> dict:
     p95). fragments_per_matched_hair: curves that follow a true fiber for 0.5 mm or more, mean over the matched_hairs.
     identity_switch_fraction: share of the curves_following a fiber that lie on two or more of them for 0.3 mm each, by
     the most probable assignment along the curve; identity_switch_raw: by the nearest fiber at each sample;
-    switches_per_100mm: changes of fiber by the assignment, per 100 mm of curve.
+    switches_per_100mm: changes of fiber by the assignment, per 100 mm of curve. calibration, where the strands have expected
+    errors: for bins of it, the number of points and the medians of expected error and distance to a true centreline (µm).
     """
     captured = strands.captured
     fine = _lines(captured.points_mm, captured.offsets, TRUTH_MM)
@@ -104,6 +106,8 @@ def score(strands: Strands, truth: Truth, tolerance_mm: float = 0.1) -> dict:
     if near.any():
         report["pos_err_um"] = _spread(1000 * distance[near])
         report["dir_err_deg"] = _spread(np.degrees(np.arccos(np.clip(np.abs((found.tangents[near] * tangent[near]).sum(1)), 0, 1))))
+    if captured.error_mm is not None:
+        report["calibration"] = _calibration(captured.error_mm, _nearest(fibers, captured.points_mm.astype(float))[0])
     raw = np.where(near, fiber, -1)
     return report | _identity(found, _assign(found, fibers, tolerance_mm), raw, report["length_mm"])
 
@@ -131,6 +135,10 @@ def summary(report: dict) -> list[tuple[str, str]]:
         rows.append(("hairs found", f"{report['matched_hairs']} of {report['n_gt_strands']}, by {report['n_curves']} curves"))
         rows.append(("pieces a hair", figure(report["fragments_per_matched_hair"], ".2f", "")))
         rows.append(("switches", figure(report["identity_switch_fraction"], ".3f", "of the curves jump from one hair to another")))
+    for told in report.get("calibration", []):
+        measured = f"measured {told['measured_um']:.2g} (medians of {told['points']} points)"
+        span = f"{told['from_um']:g} µm or more" if told["to_um"] is None else f"{told['from_um']:g} to {told['to_um']:g} µm"
+        rows.append((f"error {span}", f"expected {told['expected_um']:.2g} µm, {measured}"))
     bins = report["recall_by_visible_angles"].items()
     rows += [(f"recall, {name} angles", figure(share, ".3f", f"of {count} points")) for name, (share, count) in bins if count]
     return [(name, value.rstrip()) for name, value in rows]
@@ -156,6 +164,17 @@ def _precision(found: _Lines, truth: Truth, near: np.ndarray) -> dict:
 
     inside = reach(found.points) <= reach(truth.sample_points_mm.astype(float)).max(initial=0.0) + 0.05
     return {"precision": float(near.mean()), "precision_in_volume": float(near[inside].mean()) if inside.any() else 0.0}
+
+
+def _calibration(error_mm: np.ndarray, distance_mm: np.ndarray) -> list[dict]:
+    """How expected errors (N,) and distances (N,) agree, a record for each bin that has points; those without error are left out."""
+    error, distance = 1000 * error_mm[np.isfinite(error_mm)].astype(float), 1000 * distance_mm[np.isfinite(error_mm)]
+    place, table = np.digitize(error, ERROR_EDGES_UM), []
+    for k, (low, high) in enumerate(pairwise((0.0, *ERROR_EDGES_UM, None))):
+        if (here := place == k).any():
+            medians = {"expected_um": float(np.median(error[here])), "measured_um": float(np.median(distance[here]))}
+            table.append({"from_um": low, "to_um": high, "points": int(here.sum())} | medians)
+    return table
 
 
 def _identity(found: _Lines, assigned: np.ndarray, raw: np.ndarray, length_mm: float) -> dict:

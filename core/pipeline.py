@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from .capture import Capture, load_capture
+from .confidence import confidence, expected_error
 from .errors import CaptureError, StrandscopeError
 from .features import SweepFeatures, build_index, load_features, pack, save_features, seen_by, unpack, upright
 from .files import atomic
@@ -108,15 +109,16 @@ def reconstruct(
     _check_memory(sweeps, memory_bytes)
     index = build_index(sweeps, capture.optics)
     if parameters.paper is not None:
-        grown = grow_paper(index, parameters.paper, progress)
+        grown, error = grow_paper(index, parameters.paper, progress), None
     else:
         grown = trace(index, parameters.grow, parameters.refine, workers, progress)
+        error = expected_error(index, parameters.grow, parameters.refine, grown.points_mm, grown.offsets, grown.evidence, workers)
     if len(grown.offsets) < 2:
         raise StrandscopeError(
             f"{capture.folder}: no fiber was found in {sum(map(len, sweeps))} features; expected hairs in focus in the photographs"
         )
     provenance = {"capture": capture.name, "version": VERSION, "parameters": asdict(parameters)}
-    strands = captured_strands(grown, parameters.grow, provenance)
+    strands = captured_strands(grown, error, parameters.grow, provenance)
     if parameters.infill is not None:
         strands = concatenate([strands, infill_strands(capture, work, sweeps, strands, parameters, workers, progress)], provenance)
     save_strands(out, strands)
@@ -383,15 +385,17 @@ def _summed_up(capture: Capture, errors: RigErrors, solution: Solution, biased: 
 # ---- fibers -> strands -----------------------------------------------------------------------------------------------
 
 
-def captured_strands(grown: Grown, params: GrowParams, provenance: dict) -> Strands:
-    """The grown curves as strands. Confidence rises with the evidence for a point: 1 - exp(-evidence / 4)."""
+def captured_strands(grown: Grown, error_mm: np.ndarray | None, params: GrowParams, provenance: dict) -> Strands:
+    """The grown curves as strands. Confidence follows from the expected error (N,); where that is not known (None, the paper's
+    method), it rises with the evidence for a point: 1 - exp(-evidence / 4)."""
     return Strands(
         points_mm=grown.points_mm,
         offsets=grown.offsets,
         radius_mm=np.full(len(grown.points_mm), params.radius_mm, np.float32),
         kind=np.full(len(grown.offsets) - 1, CAPTURED, np.uint8),
-        confidence=(1 - np.exp(grown.evidence / -4.0)).astype(np.float32),
+        confidence=(1 - np.exp(grown.evidence / -4.0) if error_mm is None else confidence(error_mm)).astype(np.float32),
         stops=grown.stops,
+        error_mm=error_mm,
         provenance=provenance,
     )
 

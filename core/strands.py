@@ -23,6 +23,7 @@ class Strands:
     kind: np.ndarray  # (M,) uint8: CAPTURED or INFILL
     confidence: np.ndarray  # (N,) float32, 0 to 1
     stops: np.ndarray | None = None  # (M, 2) uint8: why either end of a curve stopped growing (``stops.Stop``), 0 unknown
+    error_mm: np.ndarray | None = None  # (N,) float32: expected error (``confidence.expected_error``), NaN where it is not known
     provenance: dict = field(default_factory=dict)  # capture's name, parameters, version
 
     def __len__(self) -> int:
@@ -44,6 +45,7 @@ class Strands:
             kind=self.kind[keep],
             confidence=self.confidence[points],
             stops=None if self.stops is None else self.stops[keep],
+            error_mm=None if self.error_mm is None else self.error_mm[points],
         )
 
     @property
@@ -78,6 +80,7 @@ def statistics(strands: Strands) -> dict:
     starts = captured.offsets[:-1]
     spans = np.maximum.reduceat(height, starts) - np.minimum.reduceat(height, starts) if len(captured) else np.zeros(0)
     infill = strands.select(strands.kind == INFILL)
+    errors = np.zeros(0) if captured.error_mm is None else captured.error_mm[np.isfinite(captured.error_mm)]
     return {
         "curves": len(captured),
         "mean_curves_crossing_a_horizontal_plane": float(spans.sum() / extent) if extent else 0.0,
@@ -94,12 +97,13 @@ def statistics(strands: Strands) -> dict:
         "points": len(strands.points_mm),
         "mean_radius_mm": float(captured.radius_mm.mean()) if len(captured) else 0.0,
         "mean_confidence": float(captured.confidence.mean()) if len(captured) else 0.0,
+        "expected_error_mm": {name: float(np.percentile(errors, p)) for name, p in (("median", 50), ("p95", 95))} if len(errors) else {},
     }
 
 
 def describe(numbers: dict) -> list[tuple[str, str]]:
     """The numbers of ``statistics`` as rows (name, value) for people."""
-    length = numbers["length_mm"]
+    length, error = numbers["length_mm"], numbers["expected_error_mm"]
     crossing = f"{numbers['mean_curves_crossing_a_horizontal_plane']:.1f} on average, over a height of {numbers['height_mm']:.1f} mm"
     return [
         ("captured curves", f"{numbers['curves']}"),
@@ -108,6 +112,7 @@ def describe(numbers: dict) -> list[tuple[str, str]]:
         ("length of all", f"{length['total']:.0f} mm"),
         ("radius", f"{numbers['mean_radius_mm']:.4f} mm"),
         ("confidence", f"{numbers['mean_confidence']:.2f} of 1"),
+        ("expected error", f"{1000 * error['median']:.1f} µm (median, 95 % below {1000 * error['p95']:.1f})" if error else "unknown"),
         ("ends of curves", ", ".join(f"{words}: {count}" for words, count in numbers["ends"].items() if count) or "unknown"),
         ("infill curves", f"{numbers['infill_curves']} ({numbers['infill_length_mm']:.0f} mm)"),
         ("points", f"{numbers['points']}"),
@@ -123,8 +128,13 @@ def concatenate(parts: list[Strands], provenance: dict) -> Strands:
         kind=np.concatenate([p.kind for p in parts]),
         confidence=np.concatenate([p.confidence for p in parts]),
         stops=np.concatenate([np.zeros((len(p), 2), np.uint8) if p.stops is None else p.stops for p in parts]),
+        error_mm=None if all(p.error_mm is None for p in parts) else np.concatenate([_errors(p) for p in parts]),
         provenance=provenance,
     )
+
+
+def _errors(strands: Strands) -> np.ndarray:
+    return np.full(len(strands.points_mm), np.nan, np.float32) if strands.error_mm is None else strands.error_mm
 
 
 def save_strands(path: Path, strands: Strands) -> None:
@@ -139,6 +149,8 @@ def save_strands(path: Path, strands: Strands) -> None:
         "stops": np.zeros((len(strands), 2), np.uint8) if strands.stops is None else strands.stops.astype(np.uint8),
         "provenance": np.array(json.dumps(strands.provenance, sort_keys=True)),
     }
+    if strands.error_mm is not None:
+        arrays["error"] = strands.error_mm.astype(np.float32)
     with atomic(path) as part:
         np.savez(part, **arrays)  # numpy writes the zip's time stamps as 1980-01-01
 
@@ -160,6 +172,7 @@ def load_strands(path: Path) -> Strands:
         kind=arrays.get("kind", np.zeros(sizes, np.uint8)),
         confidence=arrays.get("confidence", np.ones(count, np.float32)),
         stops=arrays.get("stops"),
+        error_mm=arrays.get("error"),
         provenance=provenance,
     )
     check(strands, path)
@@ -194,6 +207,10 @@ def check(strands: Strands, path: Path) -> None:
     _expect(strands.kind.shape == (len(strands),), path, "kind", strands.kind.shape, f"one value a curve ({len(strands)},)")
     if strands.stops is not None:
         _expect(strands.stops.shape == (len(strands), 2), path, "stops", strands.stops.shape, f"two values a curve ({len(strands)}, 2)")
+    if strands.error_mm is not None:
+        _expect(strands.error_mm.shape == (len(points),), path, "error", strands.error_mm.shape, f"one value a point ({len(points)},)")
+        good = np.isnan(strands.error_mm) | ((strands.error_mm >= 0) & np.isfinite(strands.error_mm))
+        _expect(bool(np.all(good)), path, "error", "outside its range", "0 mm or more, or NaN where it is not known")
     for name, values in (("points", points), ("radius", strands.radius_mm), ("confidence", strands.confidence)):
         bad = np.argwhere(~np.isfinite(values))
         if len(bad):

@@ -1,5 +1,7 @@
 """The score must tell good from bad by known amounts, and drawn curves must lie where geometry says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -53,6 +55,22 @@ def test_a_shift_is_measured_in_micrometres(hairs, truth):
     assert report["pos_err_um"]["mean"] == pytest.approx(30, abs=0.3)
     assert report["dir_err_deg"]["p95"] < 0.6
     assert report["recall"] == 1.0
+
+
+def test_expected_errors_are_compared_with_measured_ones(hairs, truth):
+    """Half of the hairs lie 5 um off and say 4, half 20 um and say 25; what is not known is left out."""
+    shifts = np.where(np.arange(16) < 8, 0.005, 0.02)
+    strands = strands_of([np.add(hair, [shift, 0, 0]) for hair, shift in zip(hairs, shifts, strict=True)])
+    error = np.repeat(np.where(shifts < 0.01, 0.004, 0.025), 101)
+    error[:50] = np.nan
+    report = score(replace(strands, error_mm=error), truth)
+    first, second = report["calibration"]
+    assert (first["from_um"], first["to_um"], first["points"]) == (3.2, 10.0, 8 * 101 - 50)
+    assert (second["from_um"], second["to_um"], second["points"]) == (10.0, 31.6, 8 * 101)
+    assert [first["expected_um"], second["expected_um"]] == pytest.approx([4, 25])
+    assert [first["measured_um"], second["measured_um"]] == pytest.approx([5, 20], rel=0.02)
+    assert ("error 3.2 to 10 µm", "expected 4 µm, measured 5 (medians of 758 points)") in summary(report)
+    assert "calibration" not in score(strands, truth)
 
 
 def test_a_tilt_is_measured_in_degrees(truth, hairs):

@@ -72,6 +72,8 @@ def test_hair_ends_up_where_it_is(capture, tmp_path):
     assert again.provenance["parameters"]["ridges"]["offset"] > 0  # as estimated, so that the run can be repeated
     assert np.all(again.confidence[again.offsets[0] : again.offsets[1]] > 0)
     assert np.all(again.stops[again.kind == CAPTURED] > 0)
+    assert np.all(again.captured.error_mm > 0)
+    assert np.all(np.isnan(again.select(again.kind != CAPTURED).error_mm))
     assert whole(tmp_path)
 
 

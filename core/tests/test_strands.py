@@ -1,5 +1,7 @@
 """Strands files: whole, finite, reproducible to the byte; and the numbers that are taken of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -29,6 +31,7 @@ def test_what_is_saved_is_loaded_and_the_bytes_are_the_same(tmp_path_factory, si
     rng = np.random.default_rng(seed)
     n = sum(sizes)
     points, radius, confidence = rng.normal(size=(n, 3)), rng.uniform(0.01, 0.1, n), rng.uniform(size=n)
+    error = np.where(rng.random(n) < 0.3, np.nan, rng.uniform(0, 0.1, n))
     strands = Strands(
         points_mm=points.astype(np.float32),
         offsets=offsets_of(np.array(sizes, int)),
@@ -36,13 +39,14 @@ def test_what_is_saved_is_loaded_and_the_bytes_are_the_same(tmp_path_factory, si
         kind=rng.integers(0, 2, len(sizes)).astype(np.uint8),
         confidence=confidence.astype(np.float32),
         stops=rng.integers(0, 5, (len(sizes), 2)).astype(np.uint8),
+        error_mm=error.astype(np.float32),
         provenance={"b": 1, "a": "ü"},
     )
     folder = tmp_path_factory.mktemp("strands")
     for name in ("one.npz", "two.npz"):
         save_strands(folder / name, strands)
     loaded = load_strands(folder / "one.npz")
-    for field in ("points_mm", "offsets", "radius_mm", "kind", "confidence", "stops"):
+    for field in ("points_mm", "offsets", "radius_mm", "kind", "confidence", "stops", "error_mm"):
         np.testing.assert_array_equal(getattr(loaded, field), getattr(strands, field))
         assert getattr(loaded, field).dtype == getattr(strands, field).dtype
     assert loaded.provenance == strands.provenance
@@ -58,6 +62,9 @@ def test_what_is_saved_is_loaded_and_the_bytes_are_the_same(tmp_path_factory, si
         ("radius", lambda a: a * np.inf, r"radius\[0\] is inf"),
         ("confidence", lambda a: a[:-1], "confidence"),
         ("confidence", lambda a: a - 1.5, "confidence"),
+        ("error", lambda a: a[:-1], "error"),
+        ("error", lambda a: a - 1, "error"),
+        ("error", lambda a: a + np.inf, "error"),
         ("offsets", lambda a: a[::-1].copy(), "offsets"),
         ("offsets", lambda a: a + 0.5, "offsets"),
         ("offsets", lambda a: np.r_[a[:-1], a[-1] + 1], "offsets"),
@@ -69,7 +76,7 @@ def test_what_is_saved_is_loaded_and_the_bytes_are_the_same(tmp_path_factory, si
     ],
 )
 def test_a_bad_array_is_named(tmp_path, array, change, said):
-    save_strands(tmp_path / "good.npz", make([vertical(0, 0, 1), vertical(1, 0, 1)]))
+    save_strands(tmp_path / "good.npz", replace(make([vertical(0, 0, 1), vertical(1, 0, 1)]), error_mm=np.full(10, 0.01)))
     arrays = dict(np.load(tmp_path / "good.npz"))
     arrays[array] = change(arrays[array])
     np.savez(tmp_path / "bad.npz", **arrays)
@@ -98,6 +105,19 @@ def test_points_and_offsets_are_enough(tmp_path):
     np.savez(tmp_path / "least.npz", points=np.eye(3), offsets=np.array([0, 3]))
     strands = load_strands(tmp_path / "least.npz")
     assert (len(strands), strands.kind[0], strands.confidence[0]) == (1, CAPTURED, 1.0)
+    assert strands.error_mm is None
+    assert statistics(strands)["expected_error_mm"] == {}
+    assert ("expected error", "unknown") in describe(statistics(strands))
+
+
+def test_expected_errors_stay_with_their_points():
+    known = replace(make([vertical(0, 0, 1), vertical(1, 0, 2, 7)]), error_mm=np.arange(12, dtype=np.float32))
+    unknown = make([vertical(2, 0, 3)], kind=[INFILL])
+    both = concatenate([known, unknown], {})
+    np.testing.assert_array_equal(both.error_mm, [*range(12), *[np.nan] * 5])
+    np.testing.assert_array_equal(both.select(np.array([False, True, True])).error_mm, [*range(5, 12), *[np.nan] * 5])
+    assert concatenate([unknown, unknown], {}).error_mm is None
+    assert statistics(both)["expected_error_mm"]["median"] == 5.5
 
 
 def test_curves_are_chosen_whole():
