@@ -27,12 +27,12 @@ class ErrorParams:
     """Weights of the three parts: those that tell the distances best in three dense locks that are known, one of another
     renderer (straight, wavy, curls): the least mean |log(distance / expected error)|, and medians that agree."""
 
-    fit: float = 0.80  # of the root of the covariance's trace across the hair
-    bend_mm2: float = 0.0101  # of the curvature at the point (1/mm)
-    astray_mm: float = 0.0173  # error that the lack of evidence makes in straight hair
-    astray_mm2: float = 0.224  # and, added as squares, in bent hair: of the curve's mean curvature (1/mm)
-    least_evidence: float = 0.32  # added to the evidence
-    power: float = 1.445  # of the evidence, with which these two fall
+    fit: float = 1.04  # of the root of the covariance's trace across the hair
+    bend_mm2: float = 0.0005  # of the curvature at the point (1/mm)
+    astray_mm: float = 0.0170  # error that the lack of evidence makes in straight hair
+    astray_mm2: float = 0.3475  # and, added as squares, in bent hair: of the curve's mean curvature (1/mm)
+    least_evidence: float = 0.36  # added to the evidence
+    power: float = 1.81  # of the evidence, with which these two fall
 
 
 @njit(cache=True, nogil=True)

@@ -24,6 +24,7 @@ from .stops import Stop
 _turn_back = njit(turn_back)
 JERKS_PER_MM2 = tuple(0.015 * 2.0**i for i in range(9))  # change of curvature a mm, at random each step, from straight hair to tight curls
 GROWING_SHARE = 0.6  # of the time of a round
+BEND_PX = 3.6  # sigma along the hair of what places a ridge, hair's width and slab included: it sees a bend from inside
 STIFF = 10.0  # cameras: what holds a point in its place along the hair
 
 
@@ -42,7 +43,7 @@ class RefineParams:
     join_turn_deg: tuple[float, float] = (2.0, 4.0)  # and a mm of gap: how well their directions must agree
     same_mm: float = 0.04  # closer than this to a better curve, along it, a curve is the same hair
     min_length_mm: float = 1.5  # shorter curves are taken for chance
-    mean_evidence: tuple[float, float] = (1.1, 2.2)  # and those that have less evidence than the first, and less than this many mm of it
+    mean_evidence: tuple[float, float] = (1.8, 0.6)  # and those that have less evidence than the first, and less than this many mm of it
 
 
 @dataclass(frozen=True)
@@ -61,12 +62,19 @@ class Curve:
 @njit(cache=True, nogil=True, fastmath=True)
 def _tie(index, points, box, normal, right):
     """What the cameras say of each point (n, 3): the sums normal (n, 3, 3) and right (n, 3) of its least squares, in cameras
-    that see it fully. Observations are those within half a step along the hair."""
+    that see it fully. Observations are those within half a step along the hair; their place is that of the hair's image
+    averaged along it, which lies by half the curvature times BEND_PX squared inside a bend."""
     n = len(points)
+    reach = min(4, (n - 1) // 2)
+    inside = 0.5 * (BEND_PX * index.pitch) ** 2
     hits = np.empty((MAX_HITS, 4))
     for j in range(n):
         g = points[min(j + 1, n - 1)] - points[max(j - 1, 0)]
         g /= np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+        bend = np.zeros(3)
+        if reach > 0:
+            m = min(max(j, reach), n - 1 - reach)
+            bend = (points[m + reach] + points[m - reach] - 2 * points[m]) / (reach * box.step) ** 2
         for c in range(3):  # a point is not to slide along its hair
             right[j, c] = 0.0
             for d in range(3):
@@ -87,8 +95,9 @@ def _tie(index, points, box, normal, right):
                 continue
             share, t = min(s / box.full_support, 1.0), np.empty(3)
             t[0], t[1], t[2] = _turn_back(frame[3, 0], frame[3, 1], frame[3, 2], index.cos[k], index.sin[k])
+            place = r / s - inside * (t[0] * bend[0] + t[1] * bend[1] + t[2] * bend[2]) / (size * size)
             for c in range(3):
-                right[j, c] += share * r / s * t[c]
+                right[j, c] += share * place * t[c]
                 for d in range(3):
                     normal[j, c, d] += share * t[c] * t[d]
 
@@ -111,7 +120,7 @@ def smoothed(points: np.ndarray, normal: np.ndarray, right: np.ndarray, price: f
         pull[a : n - 3 + a] -= price * third[a] * jump
         for b in range(a, 4):
             bands[9 - 3 * (b - a), 3 * b : 3 * (n - 3 + b)] += price * third[a] * third[b]
-    bands[9] += 1e-6 + 1e-13 * price  # a hair that nothing ties is still held somewhere
+    bands[9] += 1e-9 + 1e-13 * price  # a hair that nothing ties is still held somewhere
     factor = cholesky_banded(bands)
     move = cho_solve_banded((factor, False), pull.reshape(-1)).reshape(n, 3)
     misfit = np.einsum("ni,nij,nj", move, normal, move) - 2 * np.sum(right * move) + price * np.sum(np.diff(points + move, 3, axis=0) ** 2)
