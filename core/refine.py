@@ -35,7 +35,7 @@ class RefineParams:
     rounds: int = 3  # of the fit: ties are found anew where the curve has moved
     slab_px: float = 0.2  # error of what one camera says of one step of a curve, rows and frames that err alike included
     near_mm: float = 0.6  # evidence of a point is that of this length around it
-    step_evidence: tuple[float, float, float] = (2.5, 1.5, 0.8)  # evidence that a step needs in the rounds of ``trace``
+    step_evidence: tuple[float, float, float] = (2.5, 1.5, 0.5)  # evidence that a step needs in the rounds of ``trace``
     new_evidence: float = 0.4  # no new curve is begun in a round that asks for less
     join_cost: float = 6.0  # misfit of two ends, squared, in units of the next two
     join_mm: float = 1.5  # longest gap over which two pieces are joined
