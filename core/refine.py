@@ -35,7 +35,7 @@ class RefineParams:
     rounds: int = 3  # of the fit: ties are found anew where the curve has moved
     slab_px: float = 0.2  # error of what one camera says of one step of a curve, rows and frames that err alike included
     near_mm: float = 0.6  # evidence of a point is that of this length around it
-    step_evidence: tuple[float, float, float] = (2.5, 1.5, 0.5)  # evidence that a step needs in the rounds of ``trace``
+    step_evidence: tuple[float, float, float] = (2.5, 1.5, 0.8)  # evidence that a step needs in the rounds of ``trace``
     new_evidence: float = 0.4  # no new curve is begun in a round that asks for less
     join_cost: float = 6.0  # misfit of two ends, squared, in units of the next two
     join_mm: float = 1.5  # longest gap over which two pieces are joined
@@ -43,7 +43,7 @@ class RefineParams:
     join_turn_deg: tuple[float, float] = (2.0, 4.0)  # and a mm of gap: how well their directions must agree
     same_mm: float = 0.04  # closer than this to a better curve, along it, a curve is the same hair
     min_length_mm: float = 1.5  # shorter curves are taken for chance
-    mean_evidence: tuple[float, float] = (1.8, 0.6)  # and those that have less evidence than the first, and less than this many mm of it
+    mean_evidence: tuple[float, float] = (1.3, 1.5)  # and those that have less evidence than the first, and less than this many mm of it
 
 
 @dataclass(frozen=True)
