@@ -4,6 +4,7 @@ A capture is a folder with ``capture.json`` and photographs; nothing in it is re
 """
 
 import json
+import os
 import re
 from dataclasses import MISSING, asdict, dataclass, field, fields
 from functools import cached_property
@@ -213,7 +214,7 @@ class _Reader:
 
     def _all_there(self, capture: Capture) -> None:
         for sweep in capture.sweeps:
-            missing = [name for name in sweep.files if not (capture.folder / name).is_file()]
+            missing = [name for name in sweep.files if not os.path.isfile(capture.folder / name)]  # False for a name that is too long, too
             if missing:
                 raise CaptureError(
                     f"{self.path}: the sweep at {sweep.angle_deg:g}° lists {len(sweep.files)} files, "

@@ -151,6 +151,15 @@ def shared_capture(tmp_path_factory):
     return folder, head_of(folder)
 
 
+def test_a_name_too_long_for_a_file_is_a_missing_file(shared_capture):
+    folder, right = shared_capture
+    head = copy.deepcopy(right)
+    head["sweeps"][0]["files"][0] = "x" * 300
+    write_head(folder, head)
+    with pytest.raises(CaptureError, match="missing xxx"):
+        load_capture(folder)
+
+
 @settings(max_examples=200, deadline=None)
 @given(data=st.data())
 def test_any_value_anywhere_is_loaded_or_refused_in_one_line(shared_capture, data):
