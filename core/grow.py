@@ -1,17 +1,16 @@
 """Growing fibers through the observations of all sweeps (sec. 4.2, Figure 7).
 
-A fiber lies where the ribbons of several sweeps meet. From a seed the grower steps along it in both directions: each camera
-says how the hair is turned in its image (``find_orientations``), the direction that fits all of them best is taken
-(``solve_direction``), a step is made, and the new point is drawn back to where the ribbons meet (``solve_correction``).
+A fiber lies where the ribbons of several sweeps meet. From a seed the grower steps along it in both directions: what the way
+so far foretells is compared with the observations of all cameras in a box around it (``_look``), and the bent line that fits
+them best (``_fit``: place, direction and curvature at once) gives the next point.
 
-Departures from the paper, all off in ``PAPER``:
+Departures from the paper, whose own growing is in ``paper.py``:
 * Observations are weighted: less the farther they are from the ribbon's middle, the farther from the expected angle and the
   farther from the plane of focus. In a dense lock the box of a hair holds its neighbours as well.
-* A camera's orientation joins the angles of its features and the slope of their positions along the hair.
-* A camera speaks only when enough of its rows see the hair.
-
-* The clearest fibers come first: several passes over the seeds, each content with less evidence. The evidence of a point is
-  the sum over cameras of the share of a fully seen hair that they saw, 1 for each camera with a free view.
+* Offsets and angles are fitted together, along a line that may bend, and with what is foretold as a prior.
+* The clearest fibers come first: several passes over the seeds, each content with less evidence. A camera is evidence, up to
+  1, by how well it agrees and how sharply it sees the hair; the evidence of a point is that of the best range of adjacent
+  cameras (``_visible_range``).
 
 Seeds are grown in batches that do not depend on the number of threads: every seed of a batch grows on the observations that
 earlier batches left, then the curves are accepted in a fixed order, most evidence first, unless much of what they stand on
