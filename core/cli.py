@@ -213,7 +213,7 @@ def main_group():
 @click.option("--style", type=click.Choice(["straight", "wavy", "curls"]), default="straight", show_default=True, help="How the hair falls.")
 @click.option(
     "--scale",
-    type=click.Choice(["tiny", "small", "medium", "paper"]),
+    type=click.Choice(["tiny", "small", "slab", "medium", "paper"]),
     default="small",
     show_default=True,
     help="Size of the photographs and number of sweeps: tiny takes seconds, paper takes hours.",
@@ -565,7 +565,9 @@ def score(session, strands, truth, tolerance_mm, json_file):
 @click.option("--styles", type=Words(choices=PRESETS[1:]), default="straight,wavy,curls", show_default=True, help="Kinds of hair to simulate.")
 @click.option("--fibers", type=Words(int), default="160,340,600", show_default=True, help="Numbers of hairs in a lock.")
 @click.option("--methods", type=Words(choices=("ours", "paper")), default="ours,paper", show_default=True, help="Methods to compare.")
-@click.option("--scale", type=click.Choice(["tiny", "small", "medium", "paper"]), default="medium", show_default=True, help="Size of the locks.")
+@click.option(
+    "--scale", type=click.Choice(["tiny", "small", "slab", "medium", "paper"]), default="medium", show_default=True, help="Size of the locks."
+)
 @click.option("--seed", type=int, default=1, show_default=True, help="Another number gives other locks of the same kinds.")
 @click.option("--capture", "captures", type=PATH, multiple=True, help="Measure on this capture with its truth, too; may be given again.")
 @click.option("--jobs", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given.")

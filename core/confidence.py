@@ -10,14 +10,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
-from scipy.linalg import cholesky_banded
 
 from .features import Index
 from .grow import GrowParams
-from .refine import JERKS_PER_MM2, RefineParams, _tie, _work, smoothed
+from .refine import RefineParams, _ties, _work, bend_at_large
+from .spline import across, covariance
 
-THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
 SURE_MM = 0.02  # confidence is the chance to lie this near to a centreline
 BEND_MM = 0.4  # to either side: the length over which curvature is measured
 
@@ -35,60 +33,11 @@ class ErrorParams:
     power: float = 1.81  # of the evidence, with which these two fall
 
 
-@njit(cache=True, nogil=True)
-def diagonal_blocks(factor: np.ndarray) -> np.ndarray:
-    """The 3 x 3 blocks (n, 3, 3) on the diagonal of the inverse of a matrix A = Uᵀ U, without the rest of the inverse.
-
-    factor (b + 1, 3 n): U, upper banded as ``scipy.linalg.cholesky_banded`` gives it. From the last row upwards, each row of
-    the inverse inside the band follows from those below it (Takahashi, Fagan and Chen 1973): b² operations a row, b >= 2.
-    """
-    width, size = factor.shape[0] - 1, factor.shape[1]
-    inverse = np.zeros((size, width + 1))  # [i, k]: the element (i, i + k)
-    for i in range(size - 1, -1, -1):
-        last = min(width, size - 1 - i)
-        for k in range(last, -1, -1):
-            total = 1.0 / factor[width, i] if k == 0 else 0.0
-            for m in range(1, last + 1):
-                total -= factor[width - m, i + m] * (inverse[i + m, k - m] if k >= m else inverse[i + k, m - k])
-            inverse[i, k] = total / factor[width, i]
-    blocks = np.empty((size // 3, 3, 3))
-    for j in range(len(blocks)):
-        for c in range(3):
-            for d in range(3):
-                blocks[j, c, d] = inverse[3 * j + min(c, d), abs(c - d)]
-    return blocks
-
-
-def covariance(normal: np.ndarray, price: float) -> np.ndarray:
-    """Covariance (n, 3, 3) of each point that ``refine.smoothed`` gives for ties ``normal`` (n, 3, 3) and ``price``: the
-    blocks on the diagonal of the inverse of its matrix. n >= 4."""
-    n = len(normal)
-    bands = np.zeros((10, 3 * n))
-    for c in range(3):
-        for d in range(c, 3):
-            bands[9 - (d - c), d::3] = normal[:, c, d]
-    for a in range(4):
-        for b in range(a, 4):
-            bands[9 - 3 * (b - a), 3 * b : 3 * (n - 3 + b)] += price * THIRD[a] * THIRD[b]
-    bands[9] += 1e-9
-    return diagonal_blocks(cholesky_banded(bands))
-
-
-def spread(index: Index, points: np.ndarray, grow_params: GrowParams, params: RefineParams) -> np.ndarray:
+def spread(index: Index, points: np.ndarray, grow_params: GrowParams, params: RefineParams, bend: float = np.inf) -> np.ndarray:
     """Standard deviation (n,) mm across the hair of each point (n, 3), n >= 4, of a curve that was fitted to the
-    observations, at the stiffness that these make likeliest."""
-    work = _work(index, params, grow_params, map)
-    normal, right = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
-    _tie(index, points, work.slab, normal, right)
-    error = params.slab_px * index.pitch
-    normal, right = normal / error**2, right / error**2
-    prices = [(work.box.step**3 * jerk) ** -2 for jerk in JERKS_PER_MM2]
-    likely = [smoothed(points, normal, right, price)[1] for price in prices]
-    found = covariance(normal, prices[int(np.argmax(likely))])
-    way = np.gradient(points, axis=0)
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
-    along = np.einsum("ni,nij,nj->n", way, found, way)
-    return np.sqrt(np.maximum(np.trace(found, axis1=1, axis2=2) - along, 0.0))
+    observations, at the stiffness that these make likeliest in hair of a curvature of ``bend`` (1/mm) at large."""
+    normal, _, stiff = _ties(index, points, _work(index, params, grow_params, map).slab, params, bend)
+    return across(covariance(normal, stiff), points)
 
 
 def curvature(points: np.ndarray, half: int) -> np.ndarray:
@@ -124,12 +73,13 @@ def expected_error(
     ``workers``.
     """
     half = max(round(BEND_MM / grow_params.step_mm), 1)
+    bend = bend_at_large(((points_mm[a:b], evidence[a:b]) for a, b in pairwise(offsets)), grow_params.step_mm)
 
     def one(ends: tuple[int, int]) -> np.ndarray:
         points = np.ascontiguousarray(points_mm[slice(*ends)], float)
         if len(points) < 4:
             return np.full(len(points), np.nan)
-        known = spread(index, points, grow_params, refine_params), curvature(points, half), evidence[slice(*ends)]
+        known = spread(index, points, grow_params, refine_params, bend), curvature(points, half), evidence[slice(*ends)]
         return combined(*known, params or ErrorParams())
 
     with ThreadPoolExecutor(workers) as pool:

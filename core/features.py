@@ -28,6 +28,7 @@ ANGLE_STEPS = 256  # units of the stored angle, over pi
 STRENGTH_STEPS = 12.0  # units of the stored strength, a factor of e
 STRENGTH_LEAST = 1e-3  # strength that is stored as 0
 USED = 128  # added to the stored strength of a feature that a fiber has used up
+_STRENGTHS = STRENGTH_LEAST * np.exp(np.arange(USED) / STRENGTH_STEPS)
 
 _to_pixel, _to_image = njit(to_pixel), njit(to_image)
 
@@ -218,6 +219,12 @@ def build_index(sweeps: Sequence[SweepFeatures], optics: Optics) -> Index:
 
 def _starts(sizes) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+
+
+@njit(cache=True, nogil=True)
+def strength_of(level):
+    """Strength of the stored ``level``, used up or not."""
+    return _STRENGTHS[level & (USED - 1)]
 
 
 @njit(cache=True, nogil=True)

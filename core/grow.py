@@ -9,8 +9,8 @@ Departures from the paper, whose own growing is in ``paper.py``:
   farther from the plane of focus. In a dense lock the box of a hair holds its neighbours as well.
 * Offsets and angles are fitted together, along a line that may bend, and with what is foretold as a prior.
 * The clearest fibers come first: several passes over the seeds, each content with less evidence. A camera is evidence, up to
-  1, by how well it agrees and how sharply it sees the hair; the evidence of a point is that of the best range of adjacent
-  cameras (``_visible_range``).
+  1, by how well it agrees, how sharply it sees the hair, whether the hair is sharpest where it should be, and how much of what it
+  sees no other curve stands on; the evidence of a point is that of the best range of adjacent cameras (``_visible_range``).
 
 Seeds are grown in batches that do not depend on the number of threads: every seed of a batch grows on the observations that
 earlier batches left, then the curves are accepted in a fixed order, most evidence first, unless much of what they stand on
@@ -34,6 +34,7 @@ from .features import (
     frames_between,
     image_of,
     run_of,
+    strength_of,
 )
 from .geometry import project, slope, to_image, to_pixel, turn, turn_back
 from .progress import Progress, silent
@@ -47,7 +48,8 @@ MAX_HITS = 1024  # features that one step looks at, for each camera
 PLACE_PX, ANGLE_RAD = 0.22, 0.0436  # errors of one observation across the hair and of its angle (2.5 degrees)
 TWIST_RAD = 0.0698  # a camera that sees the hair turned by more than this (4 degrees) is no evidence for it
 SHARE_POWER = 0.1  # of the share of its observations that a camera has: many that see a little tell more than one that sees all
-UNSEEN = 0.15  # evidence that a camera costs which sees no hair where it should be
+DEEP, FOCUS = 2.3, 0.5  # of sigma_focus: how far along a ribbon a camera's depth is looked for, and how well it must agree
+UNSEEN = 0.1  # evidence that a camera costs which sees no hair where it should be
 SPREAD_PX = (0.18, 0.3)  # of a hair's observations across it; a camera whose observations spread by the second more tells nothing
 OBSERVED_TOGETHER = 17.0  # observations of one camera in a step that err alike: rows and frames that see the same
 
@@ -63,12 +65,12 @@ class GrowParams:
     min_cameras: int = 3  # m: cameras that a step needs
     bridge_mm: float = 0.5  # how far a hair is continued where it is not observed
     min_own: float = 0.45  # share of the observations of a curve that no curve before has used up
-    min_evidence: float = 2.0  # evidence that a step needs
+    min_evidence: float = 1.2  # evidence that a step needs
     seed_evidence: tuple[float, float, float] = (2.2, 1.5, 1.2)  # of a seed in each pass, in parts of what a step needs
     mean_share: float = 0.6  # of it that a curve needs on average
     min_seed_cameras: int = 4  # angles that a seed cell must have recorded
     seed_cell_mm: float = 0.2
-    min_length_mm: float = 2.0  # shorter curves are taken for chance
+    min_length_mm: float = 0.8  # shorter curves are taken for chance
     max_length_mm: float = 400.0
     sigma_px: float = 0.5  # weight across the ribbon
     agree_px: float = 0.7  # a camera whose ribbon passes farther from where the others meet is not heard
@@ -111,6 +113,8 @@ class _Box(NamedTuple):
     shared: float
     sigma_angle: float
     sigma_focus: float
+    deep: float  # reach along the ribbon, and how far off focus a camera may see a hair to be half believed
+    focus: float
     min_support: float
     full_support: float
     min_evidence: float
@@ -140,6 +144,8 @@ def _box(params: GrowParams, index: Index) -> _Box:
         shared=params.shared_weight,
         sigma_angle=float(np.radians(params.sigma_deg)),
         sigma_focus=params.sigma_focus_mm,
+        deep=DEEP * params.sigma_focus_mm,
+        focus=FOCUS * params.sigma_focus_mm,
         min_support=params.min_support,
         full_support=full_support,
         min_evidence=params.min_evidence,
@@ -183,15 +189,16 @@ def _hair_frame(index, k, p, g):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _gather(index, k, frame, angle, bend, box, hits, count):
-    """Observations of camera k in the box of a hair; hits (n, 5) receives along, across (mm), turn (rad) and weight, from
-    row ``count`` on; returns the rows there are now.
+def _gather(index, k, frame, angle, bend, sag, box, hits, count):
+    """Observations of camera k in the box of a hair; returns the rows of hits (n, 7) there are now, filled from ``count`` on with
+    along, across (mm), turn (rad), weight, depth (mm), strength weighted by turn, and how free it is of other curves.
 
-    bend: curvature of the hair towards t (1/mm). What the hair itself bends away is taken from across and turn.
+    bend, sag: curvature of the hair towards t and towards s (1/mm). What the hair itself bends away is taken from across, turn
+    and depth. Observations deeper than half[1] have no weight, but tell how deep the camera sees the hair.
     Bound by cache misses: a few dozen runs of 8-byte features.
     """
     half = box.half
-    reach = np.abs(frame[1]) * half[0] + np.abs(frame[2]) * half[1] + np.abs(frame[3]) * half[2]
+    reach = np.abs(frame[1]) * half[0] + np.abs(frame[2]) * box.deep + np.abs(frame[3]) * half[2]
     first_frame, last_frame = frames_between(index, k, frame[0, 2] - reach[2], frame[0, 2] + reach[2])
     s0, s1, b0, b1 = cell_range(index, frame[0, 0], frame[0, 1], reach[0], reach[1])
     gate = 2.2 * box.sigma_angle
@@ -206,8 +213,8 @@ def _gather(index, k, frame, angle, bend, box, hits, count):
                 across = frame[3, 0] * x + frame[3, 1] * y + frame[3, 2] * z - 0.5 * bend * along * along
                 if abs(across) > half[2] or abs(along) > half[0]:
                     continue
-                depth = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z
-                if abs(depth) > half[1]:
+                depth = frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z - 0.5 * sag * along * along
+                if abs(depth) > box.deep:
                     continue
                 # s looks at the camera and t = g x s, so a hair that turns counterclockwise in the image leans away from t
                 off = index.angle[i] * (np.pi / ANGLE_STEPS) - angle + bend * along
@@ -218,8 +225,15 @@ def _gather(index, k, frame, angle, bend, box, hits, count):
                     return count
                 # biweights of the width of Gaussians of these sigmas: no exp, and nothing from far away
                 y, z = off / box.sigma_angle, depth / box.sigma_focus
-                y, z = max(1 - 0.207 * y * y, 0.0), max(1 - 0.207 * z * z, 0.0)
-                hits[count] = along, across, off, y * y * z * z * (box.shared if index.strength[i] >= USED else 1.0)
+                y, z = max(1 - 0.207 * y * y, 0.0), max(1 - 0.207 * z * z, 0.0) if abs(depth) <= half[1] else 0.0
+                free = box.shared if index.strength[i] >= USED else 1.0
+                hits[count, 0], hits[count, 1], hits[count, 2] = along, across, off
+                hits[count, 3], hits[count, 4], hits[count, 5], hits[count, 6] = (
+                    y * y * z * z * free,
+                    depth,
+                    y * y * strength_of(index.strength[i]),
+                    free,
+                )
                 count += 1
     return count
 
@@ -227,7 +241,7 @@ def _gather(index, k, frame, angle, bend, box, hits, count):
 class _View(NamedTuple):
     """What the cameras say of a point: arrays over the sweeps."""
 
-    hits: np.ndarray  # (n, 4) observations: along, across (mm), turn (rad), weight
+    hits: np.ndarray  # (n, 7) observations, as ``_gather`` tells
     ends: np.ndarray  # (S + 1,) int64: where each camera's observations begin
     across: np.ndarray  # (S, 3) t of each ribbon, object frame
     full: np.ndarray  # (S,) weight of the observations of a hair in full view; 0 for a camera that cannot see it
@@ -236,7 +250,7 @@ class _View(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _new_view(cameras):
-    return _View(np.empty((cameras * MAX_HITS, 4)), np.zeros(cameras + 1, np.int64), np.zeros((cameras, 3)), np.zeros(cameras), np.zeros(cameras))
+    return _View(np.empty((cameras * MAX_HITS, 7)), np.zeros(cameras + 1, np.int64), np.zeros((cameras, 3)), np.zeros(cameras), np.zeros(cameras))
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -256,7 +270,9 @@ def _look(index, p, g, bend, box, view):
         tx, ty, tz = _turn_back(frame[3, 0], frame[3, 1], frame[3, 2], index.cos[k], index.sin[k])
         view.across[k] = tx, ty, tz
         view.full[k] = max(size, 0.3) * box.full_support
-        count = _gather(index, k, frame, angle, bend[0] * tx + bend[1] * ty + bend[2] * tz, box, view.hits, count)
+        sx, sy, sz = _turn_back(frame[2, 0], frame[2, 1], frame[2, 2], index.cos[k], index.sin[k])
+        towards = bend[0] * tx + bend[1] * ty + bend[2] * tz, bend[0] * sx + bend[1] * sy + bend[2] * sz
+        count = _gather(index, k, frame, angle, towards[0], towards[1], box, view.hits, count)
     view.ends[len(index.cos)] = count
     return could
 
@@ -303,7 +319,7 @@ def _fit(view, around, g, box, wide, prior):
             m[c, c] = prior[c // 2]
             b[c] = 0.0
         spoke = 0
-        narrow = 1 / (wide * box.sigma)
+        narrow, deepest = 1 / (wide * box.sigma), 1 / box.deep
         for k in range(cameras):
             view.told[k] = 0.0
             if view.ends[k + 1] == view.ends[k]:
@@ -311,9 +327,9 @@ def _fit(view, around, g, box, wide, prior):
             t = view.across[k]
             tx, ty = t[0] * ax[0] + t[1] * ax[1] + t[2] * ax[2], t[0] * ay[0] + t[1] * ay[1] + t[2] * ay[2]
             o0, o1, o2 = theta[0] * tx + theta[1] * ty, theta[2] * tx + theta[3] * ty, theta[4] * tx + theta[5] * ty
-            s0 = s1 = s2 = s3 = s4 = r0 = r1 = r2 = l0 = l1 = rest = rest2 = 0.0
+            s0 = s1 = s2 = s3 = s4 = r0 = r1 = r2 = l0 = l1 = rest = rest2 = whole = free = deep = 0.0
             for i in range(view.ends[k], view.ends[k + 1]):
-                a, across, off, w = view.hits[i]
+                a, across, off, w = view.hits[i, 0], view.hits[i, 1], view.hits[i, 2], view.hits[i, 3]
                 left = across - (o0 + a * (o1 + 0.5 * a * o2))
                 x = left * narrow
                 x = 1 - 0.207 * x * x
@@ -321,6 +337,13 @@ def _fit(view, around, g, box, wide, prior):
                     continue
                 w *= x * x
                 wa, waa = w * a, w * a * a
+                if trial == 3:
+                    z = view.hits[i, 4] * deepest
+                    z = view.hits[i, 5] * x * x * max(1 - z * z, 0.0) ** 2
+                    whole += z
+                    z *= view.hits[i, 6]
+                    free += z
+                    deep += z * view.hits[i, 4]
                 s0 += w
                 s1 += wa
                 s2 += waa
@@ -345,7 +368,10 @@ def _fit(view, around, g, box, wide, prior):
             if trial == 3:
                 spread = np.sqrt(max(rest2 / s0 - (rest / s0) ** 2, 0.0)) / (wide * box.pixel)
                 sharp = min(max(1 - (spread - SPREAD_PX[0]) / SPREAD_PX[1], 0.1), 1.2)
-                view.told[k] = min(share, 1.0) ** SHARE_POWER * agree * max(1 - twist * twist, 0.0) ** 2 * sharp
+                astray = deep / max(free, 1e-30) / box.focus
+                own = free / max(whole, 1e-30)
+                told = min(share, 1.0) ** SHARE_POWER * agree * max(1 - twist * twist, 0.0) ** 2 * sharp
+                view.told[k] = told * own / (1 + astray * astray) ** 2
             # rows of the normal matrix: place, direction, curvature along t
             block = (s0, s1, 0.5 * s2, s2 + lever * s0, 0.5 * s3 + lever * s1, 0.25 * s4 + lever * s2)
             right = (r0, r1 + lever * l0, 0.5 * r2 + lever * l1)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from .features import ANGLE_STEPS, STRENGTH_LEAST, STRENGTH_STEPS, USED, Index, cell_range, frames_between, image_of, run_of
+from .features import ANGLE_STEPS, Index, cell_range, frames_between, image_of, run_of, strength_of
 from .geometry import slope, to_pixel, turn
 from .rig.calibrate import Sightings
 
@@ -118,11 +118,6 @@ def _sightings(index, points, tangents, sides, reach, lean, rows):
 
 
 @njit(cache=True, nogil=True)
-def _strength(index, i):
-    return STRENGTH_LEAST * np.exp((index.strength[i] & (USED - 1)) / STRENGTH_STEPS)
-
-
-@njit(cache=True, nogil=True)
 def _crowd(index, k, place):
     """Strength of the observations of sweep k to the sides of a point, (before it, behind it); its own are left out."""
     half, deep = CROWD_MM
@@ -138,7 +133,7 @@ def _crowd(index, k, place):
                 x, z = abs(u - place[0]), index.positions[index.first_position[k] + index.frame[i]] - place[2]
                 if x > half or abs(v - place[1]) > height or (x < OWN_MM[0] and abs(z) < OWN_MM[1]):
                     continue
-                near = (1 - (x / half) ** 2) * _strength(index, i)
+                near = (1 - (x / half) ** 2) * strength_of(index.strength[i])
                 before += near * (z > 0)
                 behind += near * (z <= 0)
     return before, behind
@@ -171,7 +166,7 @@ def _hits(index, k, place, ways, angle, reach, hits):
                 off = index.angle[i] * (np.pi / ANGLE_STEPS) - angle
                 if abs(off - np.pi * np.round(off / np.pi)) > reach.angle or count == len(hits):
                     continue
-                hits[count] = across, depth, _strength(index, i)
+                hits[count] = across, depth, strength_of(index.strength[i])
                 count += 1
     return count
 

@@ -5,26 +5,28 @@ A curve is a smoothing spline in its plain form: a point every step, tied to the
 the change of its curvature (Whittaker 1923), which is the price that makes the observations likeliest.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
-from scipy.interpolate import CubicHermiteSpline
-from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.spatial import cKDTree
 
 from .features import USED, Index
 from .geometry import turn_back
 from .grow import MAX_HITS, Grown, GrowParams, _Box, _box, _claim, _fit, _gather, _grow_end, _hair_frame, _look, _new_view, _sees, find_seeds, grow
+from .joining import Curve, Meeting, bridged, chains, leading_to, meetings, once, paired, part, turned
 from .progress import Progress, silent
+from .spline import Stiffness, across, covariance, smoothed, stiffness
 from .stops import Stop
 
 _turn_back = njit(turn_back)
 JERKS_PER_MM2 = tuple(0.015 * 2.0**i for i in range(9))  # change of curvature a mm, at random each step, from straight hair to tight curls
 GROWING_SHARE = 0.6  # of the time of a round
 BEND_PX = 3.6  # sigma along the hair of what places a ridge, hair's width and slab included: it sees a bend from inside
+JOIN_PART, JOIN_BESIDE = 40, 2  # points of either curve that a join looks at, and those of the end itself
+BEND_STEPS = 4  # to either side: the length over which a curvature is told
 STIFF = 10.0  # cameras: what holds a point in its place along the hair
 
 
@@ -34,26 +36,25 @@ class RefineParams:
 
     rounds: int = 3  # of the fit: ties are found anew where the curve has moved
     slab_px: float = 0.2  # error of what one camera says of one step of a curve, rows and frames that err alike included
+    fit_sigma: tuple[float, float] = (0.4, 0.2)  # weight of an observation in a fit, by its way across the hair (px) and from focus (mm)
     near_mm: float = 0.6  # evidence of a point is that of this length around it
-    step_evidence: tuple[float, float, float] = (2.5, 1.5, 0.8)  # evidence that a step needs in the rounds of ``trace``
-    new_evidence: float = 0.4  # no new curve is begun in a round that asks for less
-    join_cost: float = 6.0  # misfit of two ends, squared, in units of the next two
-    join_mm: float = 1.5  # longest gap over which two pieces are joined
+    step_evidence: tuple[float, float, float] = (1.5, 0.8, 0.3)  # evidence that a step needs in the rounds of ``trace``
+    bent_evidence: tuple[float, float] = (7.0, 0.7)  # and at least in bent hair: by its curvature (1/mm), up to the second
+    new_evidence: float = 0.2  # no new curve is begun in a round that asks for less
+    join_mm: float = 2.5  # longest gap over which two pieces are joined
+    join_misfit: float = 25.0  # of two ends, squared, in units of the next two: none above is looked at
     join_place: tuple[float, float] = (0.02, 0.02)  # mm, and mm a mm of gap: how well two ends must meet in the middle of it
     join_turn_deg: tuple[float, float] = (2.0, 4.0)  # and a mm of gap: how well their directions must agree
+    join_odds: tuple[float, float, float, float] = (3.1, 1.1, 0.8, 1.0)  # that two ends are of one fiber, logarithm: without more; less for
+    # each mm of gap, less for the root of the misfit, more for the mean evidence between them
+    join_least: float = 1.0  # odds that a join needs
+    join_margin: float = 1.0  # by which it must be likelier than any other of the same end
+    carry_mm: float = 0.3  # curves are carried on beyond their ends by this, where their error is less than
+    carry_error_mm: float = 0.015
+    apart_mm: float = 0.06  # and other curves are not nearer than this: hairs are 0.06 mm thick or more
     same_mm: float = 0.04  # closer than this to a better curve, along it, a curve is the same hair
-    min_length_mm: float = 1.5  # shorter curves are taken for chance
-    mean_evidence: tuple[float, float] = (1.3, 1.5)  # and those that have less evidence than the first, and less than this many mm of it
-
-
-@dataclass(frozen=True)
-class Curve:
-    """One curve while it is being refined."""
-
-    points: np.ndarray  # (n, 3) mm, a step apart
-    evidence: np.ndarray  # (n,)
-    stops: tuple[int, int]  # why either end stopped
-    fitted: bool = False  # nothing has changed since the last fit
+    min_length_mm: float = 0.8  # shorter curves are taken for chance
+    mean_evidence: tuple[float, float] = (0.8, 1.5)  # and those that have less evidence than the first, and less than this many mm of it
 
 
 # ---- the fit ---------------------------------------------------------------------------------------------------------
@@ -67,7 +68,7 @@ def _tie(index, points, box, normal, right):
     n = len(points)
     reach = min(4, (n - 1) // 2)
     inside = 0.5 * (BEND_PX * index.pitch) ** 2
-    hits = np.empty((MAX_HITS, 4))
+    hits = np.empty((MAX_HITS, 7))
     for j in range(n):
         g = points[min(j + 1, n - 1)] - points[max(j - 1, 0)]
         g /= np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
@@ -83,7 +84,7 @@ def _tie(index, points, box, normal, right):
             frame, angle, size = _hair_frame(index, k, points[j], g)
             if size < 0.2 or not _sees(index, k, frame[0, 0], frame[0, 1], frame[0, 2]):
                 continue
-            count = _gather(index, k, frame, angle, 0.0, box, hits, 0)
+            count = _gather(index, k, frame, angle, 0.0, 0.0, box, hits, 0)
             s = r = 0.0
             for i in range(count):
                 x = hits[i, 1] / box.sigma
@@ -102,41 +103,43 @@ def _tie(index, points, box, normal, right):
                     normal[j, c, d] += share * t[c] * t[d]
 
 
-def smoothed(points: np.ndarray, normal: np.ndarray, right: np.ndarray, price: float) -> tuple[np.ndarray, float]:
-    """points (n, 3) moved to the least of: what ``normal`` (n, 3, 3) and ``right`` (n, 3) say of each point's move, and
-    ``price`` times the square of the third differences of the moved curve; and the logarithm of how likely such ties are
-    if that is the price, but for a constant. normal and right in units of the ties' own errors. A banded system, O(n).
-    """
-    n = len(points)
-    if n < 4:
-        return points, 0.0
-    third = np.array([-1.0, 3.0, -3.0, 1.0])
-    bands, pull = np.zeros((10, 3 * n)), right.copy()
-    for c in range(3):
-        for d in range(c, 3):
-            bands[9 - (d - c), d::3] = normal[:, c, d]
-    jump = np.diff(points, 3, axis=0)
-    for a in range(4):
-        pull[a : n - 3 + a] -= price * third[a] * jump
-        for b in range(a, 4):
-            bands[9 - 3 * (b - a), 3 * b : 3 * (n - 3 + b)] += price * third[a] * third[b]
-    bands[9] += 1e-9 + 1e-13 * price  # a hair that nothing ties is still held somewhere
-    factor = cholesky_banded(bands)
-    move = cho_solve_banded((factor, False), pull.reshape(-1)).reshape(n, 3)
-    misfit = np.einsum("ni,nij,nj", move, normal, move) - 2 * np.sum(right * move) + price * np.sum(np.diff(points + move, 3, axis=0) ** 2)
-    likely = 1.5 * (n - 3) * np.log(price) - np.log(factor[9]).sum() - 0.5 * misfit
-    return points + move, float(likely)
-
-
-def _fitted(index: Index, points: np.ndarray, box: _Box, params: RefineParams) -> np.ndarray:
-    """Points (n, 3) of a curve fitted to its observations, as stiff as these make likely (empirical Bayes)."""
+def _ties(index: Index, points: np.ndarray, box: _Box, params: RefineParams, bend: float) -> tuple[np.ndarray, np.ndarray, Stiffness]:
+    """What ``_tie`` says of points (n, 3), in units of its errors, and the stiffness that makes it likeliest; ``bend`` is the curvature
+    (1/mm) of the hair at large."""
     normal, right = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
+    _tie(index, points, box, normal, right)
     error = params.slab_px * index.pitch
+    normal, right = normal / error**2, right / error**2
+    choices = [stiffness(box.step, jerk, bend) for jerk in JERKS_PER_MM2]
+    return normal, right, max(choices, key=lambda stiff: smoothed(points, normal, right, stiff)[1])
+
+
+def _fitted(index: Index, points: np.ndarray, box: _Box, params: RefineParams, bend: float) -> np.ndarray:
+    """Points (n, 3) of a curve fitted to its observations, as stiff as these make likely (empirical Bayes)."""
     for _ in range(params.rounds):
-        _tie(index, points, box, normal, right)
-        fits = [smoothed(points, normal / error**2, right / error**2, (box.step**3 * jerk) ** -2) for jerk in JERKS_PER_MM2]
-        points = np.ascontiguousarray(max(fits, key=lambda fit: fit[1])[0])
+        normal, right, stiff = _ties(index, points, box, params, bend)
+        points = np.ascontiguousarray(smoothed(points, normal, right, stiff)[0])
     return points
+
+
+def _bends(points: np.ndarray, step_mm: float) -> np.ndarray:
+    """Squares (m,) of the curvature (1/mm) of a curve of points (n, 3) in one direction across it, over BEND_STEPS to either side, at
+    all points that have as many."""
+    if len(points) <= 2 * BEND_STEPS:
+        return np.zeros(0)
+    bends = points[2 * BEND_STEPS :] + points[: -2 * BEND_STEPS] - 2 * points[BEND_STEPS:-BEND_STEPS]
+    return 0.5 * np.sum(bends**2, axis=1) / (BEND_STEPS * step_mm) ** 4
+
+
+def bend_at_large(curves: Iterable[tuple[np.ndarray, np.ndarray]], step_mm: float) -> float:
+    """Curvature (1/mm) of the hair in one direction across it, root mean square, where it is seen well; of curves as points (n, 3) and
+    evidence (n,)."""
+    bends, seen = [np.zeros(0)], [np.zeros(0)]
+    for points, evidence in curves:
+        bends.append(_bends(points, step_mm))
+        seen.append(evidence[BEND_STEPS : BEND_STEPS + len(bends[-1])])
+    bends, seen = np.concatenate(bends), np.concatenate(seen)
+    return float(np.sqrt(bends[seen >= np.median(seen)].mean())) if len(bends) else np.inf
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -210,6 +213,9 @@ def trace(index: Index, grow_params: GrowParams, params: RefineParams, workers: 
     seeds = find_seeds(index, grow_params)
     for number, evidence in enumerate(params.step_evidence):
         told = _part_of(progress, number, len(params.step_evidence))
+        if curves:  # what bends is foretold less well, and meets more by chance
+            bent = bend_at_large(((c.points, c.evidence) for c in curves), grow_params.step_mm)
+            evidence = max(evidence, min(params.bent_evidence[0] * bent, params.bent_evidence[1]))
         growing = replace(grow_params, min_evidence=evidence)
         with ThreadPoolExecutor(workers) as pool:
             work = _work(index, params, growing, lambda function, items, pool=pool: list(pool.map(function, items)))
@@ -221,6 +227,9 @@ def trace(index: Index, grow_params: GrowParams, params: RefineParams, workers: 
                 index.strength[:] &= USED - 1
                 curves = stage(curves, work)
             curves = _keep(curves, work)
+            if number == len(params.step_evidence) - 1:
+                work.index.strength[:] &= USED - 1
+                curves = _carry_on(curves, work)
     progress("growing", 1, 1)
     return _flat(curves, len(seeds.centres))
 
@@ -231,14 +240,14 @@ def _part_of(progress: Progress, number: int, rounds: int) -> Progress:
 
 
 def _work(index: Index, params: RefineParams, grow_params: GrowParams, each: Callable) -> _Work:
-    box = _box(grow_params, index)
+    box, fit = _box(grow_params, index), _box(replace(grow_params, sigma_px=params.fit_sigma[0], sigma_focus_mm=params.fit_sigma[1]), index)
     wide = 1.5 * index.pitch
     slab, near = (mm / (2 * box.half[0]) for mm in (box.step, params.near_mm))  # of the length of the box
     return _Work(
         index=index,
         params=params,
         box=box,
-        slab=box._replace(half=(0.5 * box.step, box.half[1], wide), full_support=slab * box.full_support),
+        slab=fit._replace(half=(0.5 * box.step, box.half[1], wide), full_support=slab * fit.full_support),
         near=box._replace(half=(0.5 * params.near_mm, box.half[1], wide), full_support=near * box.full_support),
         each=each,
     )
@@ -256,11 +265,17 @@ def _mark(curves: list[Curve], work: _Work) -> None:
         _claim(work.index, curve.points, work.box, True)
 
 
+def _at_large(curves: list[Curve], work: _Work) -> float:
+    return bend_at_large(((c.points, c.evidence) for c in curves), work.box.step)
+
+
 def _fit_all(curves: list[Curve], work: _Work) -> list[Curve]:
+    bend = _at_large(curves, work)
+
     def one(curve: Curve) -> Curve:
         if curve.fitted:
             return curve
-        points = _fitted(work.index, np.ascontiguousarray(curve.points), work.slab, work.params)
+        points = _fitted(work.index, np.ascontiguousarray(curve.points), work.slab, work.params, bend)
         evidence = np.empty(len(points))
         _weigh(work.index, points, work.near, evidence)
         return Curve(points, evidence, curve.stops, fitted=True)
@@ -277,132 +292,80 @@ def _cut_all(curves: list[Curve], work: _Work) -> list[Curve]:
         last = int(np.argmax(surplus - low))
         first = int(np.argmin(surplus[: last + 1]))
         if last - first >= 4:
-            out.append(_part(curve, first, last))
+            out.append(part(curve, first, last))
     return out
-
-
-def _part(curve: Curve, a: int, b: int) -> Curve:
-    if b - a == len(curve.points):
-        return curve
-    stops = (curve.stops[0] if a == 0 else Stop.UNOBSERVED.value, curve.stops[1] if b == len(curve.points) else Stop.UNOBSERVED.value)
-    return Curve(curve.points[a:b], curve.evidence[a:b], stops)
-
-
-def _tangents(points: np.ndarray) -> np.ndarray:
-    way = np.gradient(points, axis=0)
-    return way / np.linalg.norm(way, axis=1, keepdims=True)
 
 
 def _once(curves: list[Curve], work: _Work) -> list[Curve]:
-    """Leave out of each curve what runs along a curve with more evidence: its ends are cut, or it goes."""
-    order = sorted(range(len(curves)), key=lambda i: -float(curves[i].evidence.sum()))
-    rank = np.empty(len(curves), int)
-    rank[order] = np.arange(len(curves))
-    if not curves:
-        return []
-    points, ways = np.concatenate([c.points for c in curves]), np.concatenate([_tangents(c.points) for c in curves])
-    owner = np.repeat(np.arange(len(curves)), [len(c.points) for c in curves])
-    same = np.zeros(len(points), bool)
-    reach = np.hypot(work.params.same_mm, 0.5 * work.box.step)
-    for a, b in cKDTree(points).query_pairs(reach):
-        if owner[a] != owner[b] and abs(ways[a] @ ways[b]) > 0.98:
-            off = points[a] - points[b]
-            if np.linalg.norm(off - ways[a] * (off @ ways[a])) < work.params.same_mm:
-                same[a if rank[owner[a]] > rank[owner[b]] else b] = True
-    out = []
-    starts = np.r_[0, np.cumsum([len(c.points) for c in curves])]
-    for i, curve in enumerate(curves):
-        own = np.flatnonzero(~same[starts[i] : starts[i + 1]])
-        if len(own) >= 4 and len(own) > 0.3 * len(curve.points):
-            out.append(_part(curve, own[0], own[-1] + 1))
-    return out
-
-
-def _ends(curves: list[Curve]) -> tuple[np.ndarray, np.ndarray]:
-    """Places and outward directions (2 M, 3) of the ends of M curves, first and last in turn."""
-    place, way = np.empty((2 * len(curves), 3)), np.empty((2 * len(curves), 3))
-    for i, curve in enumerate(curves):
-        p = curve.points
-        for e, q in enumerate((p[::-1], p)):
-            back = q[-min(7, len(q)) :]
-            t = np.arange(len(back)) - (len(back) - 1)
-            slope = np.polyfit(t, back, 2)[1] if len(back) > 4 else back[-1] - back[0]
-            place[2 * i + e], way[2 * i + e] = back[-1], slope / np.linalg.norm(slope)
-    return place, way
+    return once(curves, work.params.same_mm, work.box.step)
 
 
 def _join(curves: list[Curve], work: _Work) -> list[Curve]:
-    """Join the ends that meet: best pairs first, each end once, over gaps in which each end carried on straight to the middle
-    finds the other. (A bend that is even over the gap moves both alike.)"""
-    if len(curves) < 2:
+    """Join the ends that are of one fiber: the likeliest pairs first, each end once."""
+    params, bend = work.params, _at_large(curves, work)
+    found = meetings(curves, params.join_mm, params.join_place, params.join_turn_deg, params.join_misfit)
+    told = work.each(lambda meeting: _between(curves, meeting, work, bend), found)
+    worth = [_join_worth(meeting, evidence, params) for meeting, evidence in zip(found, told, strict=True)]
+    return chains(curves, paired(found, worth, params.join_least, params.join_margin), work.box.step)
+
+
+def _join_worth(meeting: Meeting, evidence: float, params: RefineParams) -> float:
+    """How likely two ends are of one fiber, as the logarithm of the odds."""
+    even, gap, ill, seen = params.join_odds
+    return even - gap * meeting.gap_mm - ill * np.sqrt(meeting.misfit) + seen * min(evidence, 2.0)
+
+
+def _between(curves: list[Curve], meeting: Meeting, work: _Work, bend: float) -> float:
+    """Mean evidence over the gap between two ends, and JOIN_BESIDE to either side, of the one curve that fits both."""
+    parts = [leading_to(curves, meeting.ends[0]), turned(leading_to(curves, meeting.ends[1]))]
+    parts = [part(parts[0], max(len(parts[0].points) - JOIN_PART, 0), len(parts[0].points)), part(parts[1], 0, min(JOIN_PART, len(parts[1].points)))]
+    both = bridged(parts, work.box.step)
+    points = _fitted(work.index, np.ascontiguousarray(both.points), work.slab, work.params, bend)
+    first, last = len(parts[0].points) - JOIN_BESIDE, len(points) - len(parts[1].points) + JOIN_BESIDE
+    evidence = np.empty(len(points))
+    _weigh(work.index, points, work.near, evidence)
+    return float(evidence[max(first, 0) : last].mean())
+
+
+def _carry_on(curves: list[Curve], work: _Work) -> list[Curve]:
+    """Carry curves on a little beyond their ends, where nothing supports them, as far as it is known where they go: a hair does not
+    end where it is not seen any more. What is carried on has no evidence, and keeps away from other hairs, which are as thick."""
+    params, bend = work.params, _at_large(curves, work)
+    count = round(params.carry_mm / work.box.step)
+    if not curves or count == 0:
         return curves
-    params = work.params
-    place, way = _ends(curves)
-    found = []
-    for a, b in sorted(cKDTree(place).query_pairs(params.join_mm)):
-        if a // 2 == b // 2:
-            continue
-        gap = place[b] - place[a]
-        size = np.linalg.norm(gap)
-        if size > 0.15 and (gap @ way[a] < 0.7 * size or -gap @ way[b] < 0.7 * size):
-            continue
-        miss = gap - 0.5 * size * (way[a] - way[b])
-        mean = way[a] - way[b]
-        mean /= np.linalg.norm(mean) + 1e-12
-        miss = np.linalg.norm(miss - mean * (miss @ mean))
-        turned = np.degrees(np.arccos(np.clip(-way[a] @ way[b], -1, 1)))
-        cost = (miss / (params.join_place[0] + params.join_place[1] * size)) ** 2
-        cost += (turned / (params.join_turn_deg[0] + params.join_turn_deg[1] * size)) ** 2
-        if cost < params.join_cost + 4:
-            found.append((cost + size, a, b, cost))
-    best: dict[int, list[float]] = {}
-    for _, a, b, cost in found:
-        best.setdefault(a, []).append(cost)
-        best.setdefault(b, []).append(cost)
-    partner: dict[int, int] = {}
-    for _, a, b, cost in sorted(found):
-        alone = all(sum(c < cost + 3 for c in best[e]) < 2 for e in (a, b))  # nothing else fits nearly as well
-        if cost < params.join_cost and alone and a not in partner and b not in partner:
-            partner[a], partner[b] = b, a
-    return _chains(curves, partner, work.box.step)
+    tree, owner = cKDTree(np.concatenate([c.points for c in curves])), np.repeat(np.arange(len(curves)), [len(c.points) for c in curves])
+
+    def one(number: int) -> Curve:
+        curve = curves[number]
+        ends = [0 if stop == Stop.LEFT_VOLUME else count for stop in curve.stops]
+        if len(curve.points) < 12 or not any(ends):
+            return curve
+        points = np.ascontiguousarray(curve.points)
+        normal, right, stiff = _ties(work.index, points, work.slab, params, bend)
+        points = np.concatenate([_onward(points[::-1], ends[0])[::-1], points, _onward(points, ends[1])])
+        inner = slice(ends[0], ends[0] + len(curve.points))
+        pads = (tuple(ends), (0, 0))
+        normal, right = np.pad(normal, (*pads, (0, 0))), np.pad(right, pads)
+        fitted = smoothed(points, normal, right, stiff)[0]
+        good = across(covariance(normal, stiff), fitted) < params.carry_error_mm
+        good &= np.array([all(owner[near] == number) for near in tree.query_ball_point(fitted, params.apart_mm)])
+        good[inner] = True
+        first = ends[0] - int(np.cumprod(good[: ends[0]][::-1]).sum())
+        last = inner.stop + int(np.cumprod(good[inner.stop :]).sum())
+        evidence = np.pad(curve.evidence, ends)
+        return Curve(np.ascontiguousarray(fitted[first:last]), evidence[first:last], curve.stops, curve.fitted)
+
+    return work.each(one, range(len(curves)))
 
 
-def _chains(curves: list[Curve], partner: dict[int, int], step: float) -> list[Curve]:
-    """Curves put together at the ends (2 i the first, 2 i + 1 the last of curve i) that ``partner`` pairs."""
-    done, out = set(), []
-    heads = [e for e in range(2 * len(curves)) if e not in partner]
-    for head in heads + sorted(partner):  # what is left after the open ends are closed rings
-        if head // 2 in done:
-            continue
-        parts, end = [], head
-        while end is not None and end // 2 not in done:
-            done.add(end // 2)
-            parts.append(curves[end // 2] if end % 2 == 0 else _reversed(curves[end // 2]))
-            end = partner.get(end ^ 1)
-        out.append(parts[0] if len(parts) == 1 else _bridged(parts, step))
-    return out
-
-
-def _reversed(curve: Curve) -> Curve:
-    return Curve(np.ascontiguousarray(curve.points[::-1]), curve.evidence[::-1], curve.stops[::-1], curve.fitted)
-
-
-def _bridged(parts: list[Curve], step: float) -> Curve:
-    """One curve of many, with points a step apart over the gaps between them."""
-    points, evidence = [parts[0].points], [parts[0].evidence]
-    for curve in parts[1:]:
-        a, b = points[-1], curve.points
-        gap = np.linalg.norm(b[0] - a[-1])
-        count = max(round(gap / step), 1)
-        if gap < 0.5 * step:  # they touch
-            b, curve = b[1:], Curve(curve.points[1:], curve.evidence[1:], curve.stops)
-        elif count > 1:
-            ways = [_tangents(a)[-1], _tangents(b)[0]]
-            points.append(CubicHermiteSpline([0, gap], [a[-1], b[0]], ways)(gap * np.arange(1, count) / count))
-            evidence.append(np.zeros(count - 1))
-        points.append(b)
-        evidence.append(curve.evidence)
-    return Curve(np.concatenate(points), np.concatenate(evidence), (parts[0].stops[0], parts[-1].stops[1]))
+def _onward(points: np.ndarray, count: int) -> np.ndarray:
+    """``count`` points that carry a curve on with the curvature of its end; a start for the fit."""
+    step = np.arange(1, count + 1)[:, None]
+    half = 5
+    bend = (points[-1] + points[-1 - 2 * half] - 2 * points[-1 - half]) / half**2
+    way = (points[-1] - points[-1 - half]) / half + 0.5 * half * bend
+    return points[-1] + step * way + 0.5 * step**2 * bend
 
 
 def _extend(curves: list[Curve], work: _Work) -> list[Curve]:

@@ -55,6 +55,7 @@ SCALES = {
     "tiny": Scale(180, 150, 16, 1.8, 24, 1.5, 4),  # seconds
     "small": Scale(300, 240, 24, 3.0, 100, 2.8, 8),  # a minute
     "medium": Scale(420, 420, 24, 6.0, 340, 5.2, 24),  # minutes: a lock of 11 mm in 12 mm
+    "slab": Scale(180, 420, 24, 6.0, 340, 5.2, 0),  # the middle 5 mm of that, to measure many locks
     "paper": Scale(1462, 2193, 24, 37.5, 3000, 18.0, 360),  # hours: the capture of the paper, sec. 3
 }
 
@@ -627,9 +628,9 @@ def plan(out: Path, params: SimulateParams) -> Capture:
     angles = np.arange(scale.angles) * 360 / scale.angles
     sweeps = tuple(Sweep(float(angle), positions, tuple(f"sweep_{i:03d}/img_{j:04d}.dng" for j in range(count))) for i, angle in enumerate(angles))
     turns = tuple(float(i * 360 / scale.turntable) for i in range(scale.turntable))
-    turntable = Turntable(params.turntable_f_number, tuple(f"turntable/img_{i:03d}.dng" for i in range(scale.turntable)), turns, 0.0)
-    fibers = params.fibers or scale.fibers
-    return Capture(Path(out), f"simulated {params.style} hair, {fibers} fibers, seed {params.seed}", optics, sweeps, turntable, "truth.npz")
+    stills = Turntable(params.turntable_f_number, tuple(f"turntable/img_{i:03d}.dng" for i in range(scale.turntable)), turns, 0.0)
+    name = f"simulated {params.style} hair, {params.fibers or scale.fibers} fibers, seed {params.seed}"
+    return Capture(Path(out), name, optics, sweeps, stills if turns else None, "truth.npz")
 
 
 def simulate(out: Path, params: SimulateParams, progress: Progress = silent, workers: int = 0) -> Capture:
@@ -699,9 +700,8 @@ def _photographs(capture: Capture, hair: Hair, params: SimulateParams, progress:
     reach = float(np.percentile(np.hypot(hair.points_mm[:, 0], hair.points_mm[:, 2]), 99))  # few fibers fly off farther
     stopped = replace(optics, aperture_cone_deg=stopped_cone_deg(params))
     sequences = [(s.angle_deg, d, f, optics, g) for s in capture.sweeps for d, f, g in zip(s.positions_mm, s.files, s.gains, strict=True)]
-    sequences += [
-        (a, capture.turntable.focus_mm, f, stopped, 1.0) for a, f in zip(capture.turntable.angles_deg, capture.turntable.files, strict=True)
-    ]
+    if stills := capture.turntable:
+        sequences += [(a, stills.focus_mm, f, stopped, 1.0) for a, f in zip(stills.angles_deg, stills.files, strict=True)]
     by_angle: dict[float, list] = {}
     for number, (angle, *shot) in enumerate(sequences):
         by_angle.setdefault(angle, []).append((number, *shot))

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from strandscope.core.features import build_index
 from strandscope.core.grow import GrowParams, grow
-from strandscope.core.refine import RefineParams, smoothed, trace
+from strandscope.core.refine import RefineParams, bend_at_large, trace
 
 from .known import OPTICS, Seen, helix, in_volume, line, observe, wave
 
@@ -70,10 +70,21 @@ def test_ends_that_do_not_meet_are_not_joined():
     assert owners == [0, 1]
 
 
-def test_an_end_is_not_carried_on_past_the_hair():
-    points = curves_of(traced([line()], hidden=lambda points, _sweep: points[:, 1] < -1.2))[0]
+@pytest.mark.parametrize("carry_mm", [0.0, 0.3])
+def test_a_curve_ends_a_little_past_the_hair_that_is_seen(carry_mm):
+    points = curves_of(traced([line()], params=RefineParams(carry_mm=carry_mm), hidden=lambda points, _sweep: points[:, 1] < -1.2))[0]
     # evidence of a point is that of 0.6 mm around it; half of it is enough
-    assert points[:, 1].min() == pytest.approx(-1.2, abs=0.35)
+    assert points[:, 1].min() == pytest.approx(-1.2 - carry_mm, abs=0.35)
+    assert distances(line(), points).max() < 0.02
+
+
+def test_a_curve_is_not_carried_on_into_another_hair():
+    """A fiber is not seen any more some way before it would run into one that crosses its way; evidence reaches 0.3 mm on."""
+    first, second = line((0, 0, 0), (0, 1, 0)), line((0, -1.2, 0), (1, 0, 0))
+    found = curves_of(traced([first[first[:, 1] > -0.8], second], Seen(angles=24)))
+    upright = min(found, key=lambda points: np.abs(points[:, 0]).max())
+    assert distances(second, upright).min() > 0.05
+    assert upright[:, 1].min() < -1.05
 
 
 @pytest.mark.parametrize("apart_mm", [0.08, 0.2])
@@ -105,51 +116,13 @@ def test_progress_goes_forward_and_ends():
     assert told[-1] == 1
 
 
-# ---- the smoother ----------------------------------------------------------------------------------------------------
-
-
-def ties(count, weight=1.0):
-    return np.repeat(weight * np.eye(3)[None], count, axis=0)
-
-
-def test_what_has_no_third_difference_is_kept():
-    t = np.arange(30.0)[:, None]
-    parabola = np.concatenate([t, 0.3 * t**2, 1 - 0.1 * t - 0.02 * t**2], axis=1)
-    moved, _ = smoothed(parabola, ties(30), np.zeros((30, 3)), 100.0)
-    assert np.abs(moved - parabola).max() < 1e-9
-
-
-def test_the_smoother_is_the_least_of_its_two_prices():
-    rng = np.random.default_rng(2)
-    points, pull = rng.normal(size=(12, 3)), rng.normal(size=(12, 3))
-    weights = np.einsum("nij,nkj->nik", *(2 * [rng.normal(size=(12, 3, 3))])) + 0.1 * np.eye(3)
-    third = np.zeros((9, 12))
-    for i in range(9):
-        third[i, i : i + 4] = -1, 3, -3, 1
-    matrix = np.zeros((36, 36))
-    for i in range(12):
-        matrix[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = weights[i]
-    roughness = np.kron(third.T @ third, np.eye(3))
-    wanted = points + np.linalg.solve(matrix + 0.7 * roughness, pull.ravel() - 0.7 * roughness @ points.ravel()).reshape(12, 3)
-    assert np.abs(smoothed(points, weights, pull, 0.7)[0] - wanted).max() < 1e-6
-
-
-def test_a_place_without_ties_is_carried_on_evenly():
-    t = np.linspace(0, 3, 31)[:, None]
-    curve = np.concatenate([t, 0.2 * t**2, 0 * t], axis=1)
-    bent = curve.copy()
-    bent[12:18, 1] += 0.3
-    free = ties(31)
-    free[12:18] = 0.0
-    assert np.abs(smoothed(bent, free, np.zeros((31, 3)), 1.0)[0] - curve).max() < 0.02
-
-
-@pytest.mark.parametrize("jerk", [0.02, 0.2, 2.0])
-def test_the_likeliest_price_is_that_of_the_curve(jerk):
-    """Third differences at random of a known size, places known to 0.1: the likeliest of prices a factor 4 apart is the true one."""
-    rng = np.random.default_rng(3)
-    truth = np.cumsum(np.cumsum(np.cumsum(rng.normal(0, jerk, (300, 3)), axis=0), axis=0), axis=0)
-    seen = truth + rng.normal(0, 0.1, truth.shape)
-    prices = [(jerk * 4.0**i) ** -2.0 for i in range(-2, 3)]
-    likely = [smoothed(seen, ties(300, 100.0), np.zeros((300, 3)), price)[1] for price in prices]
-    assert np.argmax(likely) == 2
+def test_the_curvature_at_large_is_that_of_what_is_seen_well():
+    """A helix seen well, and a line seen badly whose points err by 20 um."""
+    radius, rise = 0.5, 10 / (2 * np.pi)
+    bent = helix(radius, 10.0)[::25]  # some 0.1 mm apart
+    step = float(np.linalg.norm(np.diff(bent, axis=0), axis=1).mean())
+    rough = line()[::20] + np.random.default_rng(0).normal(0, 0.02, (len(line()[::20]), 3))
+    # in one of two directions across the hair, root mean square
+    expected = radius / (radius**2 + rise**2) / np.sqrt(2)
+    curves = [(bent, np.full(len(bent), 8.0)), (rough, np.full(len(rough), 1.0))]
+    assert bend_at_large(curves, step) == pytest.approx(expected, rel=0.02)

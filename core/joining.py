@@ -1,0 +1,169 @@
+"""Pieces of curves: which are doubles, which belong to one fiber, and how they are put together.
+
+Nothing here looks at observations; ``refine.py`` does, and asks.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial import cKDTree
+
+from .stops import Stop
+
+END = 7  # points of a curve that tell the direction of its end
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One curve while it is being refined."""
+
+    points: np.ndarray  # (n, 3) mm, a step apart
+    evidence: np.ndarray  # (n,)
+    stops: tuple[int, int]  # why either end stopped
+    fitted: bool = False  # nothing has changed since the last fit
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """Two ends that may be of one fiber. End 2 i is the first point of curve i, 2 i + 1 its last."""
+
+    ends: tuple[int, int]
+    gap_mm: float
+    misfit: float  # squared: how far each end, carried on straight to the middle, misses the other in place and direction
+
+
+def part(curve: Curve, a: int, b: int) -> Curve:
+    """Points a … b - 1 of a curve."""
+    if b - a == len(curve.points):
+        return curve
+    stops = (curve.stops[0] if a == 0 else Stop.UNOBSERVED.value, curve.stops[1] if b == len(curve.points) else Stop.UNOBSERVED.value)
+    return Curve(np.ascontiguousarray(curve.points[a:b]), curve.evidence[a:b], stops)
+
+
+def turned(curve: Curve) -> Curve:
+    """The curve the other way round."""
+    return Curve(np.ascontiguousarray(curve.points[::-1]), curve.evidence[::-1], curve.stops[::-1], curve.fitted)
+
+
+def leading_to(curves: Sequence[Curve], end: int) -> Curve:
+    """The curve of an end, turned so that this end is its last point."""
+    return curves[end // 2] if end % 2 else turned(curves[end // 2])
+
+
+def tangents(points: np.ndarray) -> np.ndarray:
+    """Unit directions (n, 3) of a curve of points (n, 3)."""
+    way = np.gradient(points, axis=0)
+    return way / np.linalg.norm(way, axis=1, keepdims=True)
+
+
+def once(curves: Sequence[Curve], same_mm: float, step_mm: float) -> list[Curve]:
+    """Leave out of each curve what runs along a curve with more evidence, nearer than same_mm: its ends are cut, or it goes."""
+    if not curves:
+        return []
+    order = sorted(range(len(curves)), key=lambda i: -float(curves[i].evidence.sum()))
+    rank = np.empty(len(curves), int)
+    rank[order] = np.arange(len(curves))
+    points, ways = np.concatenate([c.points for c in curves]), np.concatenate([tangents(c.points) for c in curves])
+    owner = np.repeat(np.arange(len(curves)), [len(c.points) for c in curves])
+    same = np.zeros(len(points), bool)
+    pairs = cKDTree(points).query_pairs(np.hypot(same_mm, 0.5 * step_mm), output_type="ndarray")
+    one, other = pairs.T
+    apart = (owner[one] != owner[other]) & (np.abs((ways[one] * ways[other]).sum(axis=1)) > 0.98)
+    off = points[one] - points[other]
+    off -= ways[one] * (off * ways[one]).sum(axis=1, keepdims=True)
+    near = apart & (np.linalg.norm(off, axis=1) < same_mm)
+    less = rank[owner[one]] > rank[owner[other]]
+    same[np.where(less, one, other)[near]] = True
+    out = []
+    starts = np.r_[0, np.cumsum([len(c.points) for c in curves])]
+    for i, curve in enumerate(curves):
+        own = np.flatnonzero(~same[starts[i] : starts[i + 1]])
+        if len(own) >= 4 and len(own) > 0.3 * len(curve.points):
+            out.append(part(curve, own[0], own[-1] + 1))
+    return out
+
+
+def end_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Place and outward unit direction of the last of points (n, 3)."""
+    back = points[-min(END, len(points)) :]
+    slope = np.polyfit(np.arange(len(back)) - (len(back) - 1), back, 2)[1] if len(back) > 4 else back[-1] - back[0]
+    return back[-1], slope / np.linalg.norm(slope)
+
+
+def misfit(place_a, way_a, place_b, way_b, place_mm: tuple[float, float], turn_deg: tuple[float, float]) -> float:
+    """How ill two ends, with outward directions, go together, squared. Each is carried on straight to the middle of the gap, since a
+    bend that is even over the gap moves both alike; place_mm and turn_deg are what is expected, and as much more a mm of gap."""
+    gap = place_b - place_a
+    size, mean = np.linalg.norm(gap), way_a - way_b
+    miss = gap - 0.5 * size * mean
+    mean = mean / (np.linalg.norm(mean) + 1e-12)
+    miss = np.linalg.norm(miss - mean * (miss @ mean))
+    bent = np.degrees(np.arccos(np.clip(-way_a @ way_b, -1, 1)))
+    return float((miss / (place_mm[0] + place_mm[1] * size)) ** 2 + (bent / (turn_deg[0] + turn_deg[1] * size)) ** 2)
+
+
+def meetings(curves: Sequence[Curve], within_mm: float, place_mm, turn_deg, most: float) -> list[Meeting]:
+    """The pairs of ends of different curves that look at each other over a gap, with a misfit up to ``most``; in a fixed order."""
+    if len(curves) < 2:
+        return []
+    places, ways = (np.array(a) for a in zip(*(end_of(leading_to(curves, e).points) for e in range(2 * len(curves))), strict=True))
+    found = []
+    for a, b in sorted(cKDTree(places).query_pairs(within_mm)):
+        gap = places[b] - places[a]
+        size = float(np.linalg.norm(gap))
+        if a // 2 == b // 2 or (size > 0.15 and (gap @ ways[a] < 0.7 * size or -gap @ ways[b] < 0.7 * size)):
+            continue
+        ill = misfit(places[a], ways[a], places[b], ways[b], place_mm, turn_deg)
+        if ill <= most:
+            found.append(Meeting((a, b), size, ill))
+    return found
+
+
+def paired(meetings: Sequence[Meeting], worth: Sequence[float], least: float, margin: float) -> dict[int, int]:
+    """Which ends to join: those worth most first, each end once, down to ``least``; none that has a rival worth nearly as much."""
+    rivals: dict[int, list[float]] = {}
+    for meeting, w in zip(meetings, worth, strict=True):
+        for end in meeting.ends:
+            rivals.setdefault(end, []).append(w)
+    partner: dict[int, int] = {}
+    for w, (a, b) in sorted(((w, m.ends) for m, w in zip(meetings, worth, strict=True)), key=lambda pair: (-pair[0], pair[1])):
+        alone = all(sum(r > w - margin for r in rivals[end]) < 2 for end in (a, b))
+        if w > least and alone and a not in partner and b not in partner:
+            partner[a], partner[b] = b, a
+    return partner
+
+
+def chains(curves: Sequence[Curve], partner: dict[int, int], step_mm: float) -> list[Curve]:
+    """Curves put together at the ends that ``partner`` pairs."""
+    done, out = set(), []
+    heads = [e for e in range(2 * len(curves)) if e not in partner]
+    for head in heads + sorted(partner):  # what is left after the open ends are closed rings
+        if head // 2 in done:
+            continue
+        parts, end = [], head
+        while end is not None and end // 2 not in done:
+            done.add(end // 2)
+            parts.append(leading_to(curves, end ^ 1))
+            end = partner.get(end ^ 1)
+        out.append(parts[0] if len(parts) == 1 else bridged(parts, step_mm))
+    return out
+
+
+def bridged(parts: Sequence[Curve], step_mm: float) -> Curve:
+    """One curve of many, with points a step apart over the gaps between them."""
+    points, evidence = [parts[0].points], [parts[0].evidence]
+    for curve in parts[1:]:
+        a, b = points[-1], curve.points
+        gap = np.linalg.norm(b[0] - a[-1])
+        count = max(round(gap / step_mm), 1)
+        if gap < 0.5 * step_mm:  # they touch
+            b, curve = b[1:], Curve(curve.points[1:], curve.evidence[1:], curve.stops)
+        elif count > 1:
+            ways = [tangents(a)[-1], tangents(b)[0]]
+            points.append(CubicHermiteSpline([0, gap], [a[-1], b[0]], ways)(gap * np.arange(1, count) / count))
+            evidence.append(np.zeros(count - 1))
+        points.append(b)
+        evidence.append(curve.evidence)
+    return Curve(np.concatenate(points), np.concatenate(evidence), (parts[0].stops[0], parts[-1].stops[1]))
