@@ -167,3 +167,35 @@ def bridged(parts: Sequence[Curve], step_mm: float) -> Curve:
         points.append(b)
         evidence.append(curve.evidence)
     return Curve(np.concatenate(points), np.concatenate(evidence), (parts[0].stops[0], parts[-1].stops[1]))
+
+
+@dataclass(frozen=True)
+class Passing:
+    """An end of a curve beside another curve that runs the same way: perhaps what lies beyond on that one is of the same fiber."""
+
+    end: int  # 2 i is the first point of curve i, 2 i + 1 its last
+    other: int  # number of the other curve
+    at: int  # its point beside the end
+    onward: bool  # the end points at the later points of the other curve
+
+
+def passings(curves: Sequence[Curve], within_mm: float, turn_deg: float, inner: int) -> list[Passing]:
+    """Where an end lies within_mm from a point of another curve, ``inner`` points or more from that one's ends, and turned by no
+    more than turn_deg; in a fixed order."""
+    if len(curves) < 2:
+        return []
+    points = np.concatenate([c.points for c in curves])
+    starts = np.r_[0, np.cumsum([len(c.points) for c in curves])]
+    owner, tree, found = np.repeat(np.arange(len(curves)), np.diff(starts)), cKDTree(points), []
+    for end in range(2 * len(curves)):
+        place, way = end_of(leading_to(curves, end).points)
+        for other in np.unique(owner[tree.query_ball_point(place, within_mm)]):
+            line = curves[other].points
+            at = int(np.argmin(np.linalg.norm(line - place, axis=1)))
+            if other == end // 2 or not inner <= at < len(line) - inner:
+                continue
+            along = line[at + 2] - line[at - 2]
+            turn = along @ way / np.linalg.norm(along)
+            if abs(turn) >= np.cos(np.radians(turn_deg)):
+                found.append(Passing(end, int(other), at, bool(turn > 0)))
+    return found

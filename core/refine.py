@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from .features import USED, Index
 from .geometry import turn_back
 from .grow import MAX_HITS, Grown, GrowParams, _Box, _box, _claim, _fit, _gather, _grow_end, _hair_frame, _look, _new_view, _sees, find_seeds, grow
-from .joining import Curve, Meeting, bridged, chains, leading_to, meetings, once, paired, part, turned
+from .joining import Curve, Meeting, Passing, bridged, chains, end_of, leading_to, meetings, once, paired, part, passings, turned
 from .progress import Progress, silent
 from .spline import Stiffness, across, covariance, smoothed, stiffness
 from .stops import Stop
@@ -27,6 +27,9 @@ GROWING_SHARE = 0.6  # of the time of a round
 BEND_PX = 3.6  # sigma along the hair of what places a ridge, hair's width and slab included: it sees a bend from inside
 JOIN_PART, JOIN_BESIDE = 40, 2  # points of either curve that a join looks at, and those of the end itself
 BEND_STEPS = 4  # to either side: the length over which a curvature is told
+UNCROSS_MM, UNCROSS_DEG = 0.2, 20.0  # how near an end must be to another curve to claim the rest of it, and how much turned
+UNCROSS_INNER = 12  # points to either side of the nearest, of which one is the weakest of the other curve
+LEAST_DIP = 0.3  # evidence: less is not told apart
 STIFF = 10.0  # cameras: what holds a point in its place along the hair
 
 
@@ -49,6 +52,7 @@ class RefineParams:
     # each mm of gap, less for the root of the misfit, more for the mean evidence between them
     join_least: float = 1.0  # odds that a join needs
     join_margin: float = 1.0  # by which it must be likelier than any other of the same end
+    uncross: float = 2.5  # times more evidence that a way needs to take the place of another
     carry_mm: float = 0.3  # curves are carried on beyond their ends by this, where their error is less than
     carry_error_mm: float = 0.015
     apart_mm: float = 0.06  # and other curves are not nearer than this: hairs are 0.06 mm thick or more
@@ -327,34 +331,70 @@ def _between(curves: list[Curve], meeting: Meeting, work: _Work, bend: float) ->
     return float(evidence[max(first, 0) : last].mean())
 
 
+def _uncross(curves: list[Curve], work: _Work) -> list[Curve]:
+    """Where a curve left its fiber for one beside it, and a piece of that one ends there: give the piece what is its own. The weakest
+    point of the way that this makes must have more evidence than that of the way there is, by a factor of ``uncross``."""
+    bend = _at_large(curves, work)
+    found = passings(curves, UNCROSS_MM, UNCROSS_DEG, UNCROSS_INNER)
+    tried = work.each(lambda passing: _exchanged(curves, passing, work, bend), found)
+    taken: set[int] = set()
+    out = list(curves)
+    for number in sorted(range(len(found)), key=lambda i: (-tried[i][0], i)):
+        pair = {found[number].end // 2, found[number].other}
+        if tried[number][0] > work.params.uncross and not pair & taken:
+            taken |= pair
+            out[found[number].end // 2], out[found[number].other] = tried[number][1:]
+    return out
+
+
+def _exchanged(curves: list[Curve], passing: Passing, work: _Work, bend: float) -> tuple[float, Curve, Curve]:
+    """(how many times more evidence the weakest point has, the piece with what lies beyond on the other curve, what is left of
+    that one), if the other curve is cut where it has least evidence near the end of the piece; 0 where that cannot be."""
+    own = leading_to(curves, passing.end)
+    other = curves[passing.other] if passing.onward else turned(curves[passing.other])
+    at = passing.at if passing.onward else len(other.points) - 1 - passing.at
+    near = slice(at - UNCROSS_INNER + 2, at + UNCROSS_INNER - 1)
+    dip = near.start + int(np.argmin(other.evidence[near]))
+    own, before, beyond = part(own, 0, len(own.points) - 2), part(other, 0, dip), part(other, dip + 3, len(other.points))
+    if min(map(len, (own.points, before.points, beyond.points))) < 8:
+        return 0.0, own, other
+    forward = beyond.points[0] - own.points[-1]
+    if forward @ end_of(own.points)[1] < 0.5 * np.linalg.norm(forward):
+        return 0.0, own, other
+    both = bridged([own, beyond], work.box.step)
+    middle = slice(max(len(own.points) - JOIN_PART, 0), len(both.points) - max(len(beyond.points) - JOIN_PART, 0))
+    points = _fitted(work.index, np.ascontiguousarray(both.points[middle]), work.slab, work.params, bend)
+    evidence = np.empty(len(points))
+    _weigh(work.index, points, work.near, evidence)
+    way = slice(len(own.points) - middle.start - 5, len(points) - (middle.stop - (len(both.points) - len(beyond.points))) + 5)
+    return float(evidence[way].min() / max(other.evidence[dip], LEAST_DIP)), both, before
+
+
 def _carry_on(curves: list[Curve], work: _Work) -> list[Curve]:
     """Carry curves on a little beyond their ends, where nothing supports them, as far as it is known where they go: a hair does not
     end where it is not seen any more. What is carried on has no evidence, and keeps away from other hairs, which are as thick."""
     params, bend = work.params, _at_large(curves, work)
     count = round(params.carry_mm / work.box.step)
-    if not curves or count == 0:
+    if not curves:
         return curves
     tree, owner = cKDTree(np.concatenate([c.points for c in curves])), np.repeat(np.arange(len(curves)), [len(c.points) for c in curves])
 
     def one(number: int) -> Curve:
         curve = curves[number]
-        ends = [0 if stop == Stop.LEFT_VOLUME else count for stop in curve.stops]
-        if len(curve.points) < 12 or not any(ends):
-            return curve
-        points = np.ascontiguousarray(curve.points)
-        normal, right, stiff = _ties(work.index, points, work.slab, params, bend)
-        points = np.concatenate([_onward(points[::-1], ends[0])[::-1], points, _onward(points, ends[1])])
-        inner = slice(ends[0], ends[0] + len(curve.points))
-        pads = (tuple(ends), (0, 0))
-        normal, right = np.pad(normal, (*pads, (0, 0))), np.pad(right, pads)
-        fitted = smoothed(points, normal, right, stiff)[0]
-        good = across(covariance(normal, stiff), fitted) < params.carry_error_mm
-        good &= np.array([all(owner[near] == number) for near in tree.query_ball_point(fitted, params.apart_mm)])
-        good[inner] = True
-        first = ends[0] - int(np.cumprod(good[: ends[0]][::-1]).sum())
-        last = inner.stop + int(np.cumprod(good[inner.stop :]).sum())
-        evidence = np.pad(curve.evidence, ends)
-        return Curve(np.ascontiguousarray(fitted[first:last]), evidence[first:last], curve.stops, curve.fitted)
+        points, evidence = np.ascontiguousarray(curve.points), curve.evidence
+        ends = [0 if stop == Stop.LEFT_VOLUME or len(points) < 12 else count for stop in curve.stops]
+        if any(ends):
+            normal, right, stiff = _ties(work.index, points, work.slab, params, bend)
+            inner = slice(ends[0], ends[0] + len(points))
+            points = np.concatenate([_onward(points[::-1], ends[0])[::-1], points, _onward(points, ends[1])])
+            normal, right = np.pad(normal, (ends, (0, 0), (0, 0))), np.pad(right, (ends, (0, 0)))
+            points = smoothed(points, normal, right, stiff)[0]
+            good = across(covariance(normal, stiff), points) < params.carry_error_mm
+            good &= np.array([all(owner[near] == number) for near in tree.query_ball_point(points, params.apart_mm)])
+            first = inner.start - int(np.cumprod(good[: inner.start][::-1]).sum())
+            last = inner.stop + int(np.cumprod(good[inner.stop :]).sum())
+            points, evidence = np.ascontiguousarray(points[first:last]), np.pad(evidence, ends)[first:last]
+        return Curve(_fitted(work.index, points, work.slab, params, bend), evidence, curve.stops, fitted=True)
 
     return work.each(one, range(len(curves)))
 
@@ -398,7 +438,7 @@ def _keep(curves: list[Curve], work: _Work) -> list[Curve]:
     ]
 
 
-_TIDY = (_fit_all, _cut_all, _once, _join, _fit_all)
+_TIDY = (_fit_all, _cut_all, _once, _uncross, _join, _fit_all)
 STAGES = (*_TIDY, _extend, *_TIDY)  # of a round
 
 

@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from strandscope.core.features import build_index
-from strandscope.core.grow import GrowParams, Stop, grow, solve_direction
+from strandscope.core.grow import GrowParams, Stop, _box, _claim, grow, solve_direction
+from strandscope.core.refine import _weigh
 
 from .known import OPTICS, Seen, helix, in_volume, line, observe, wave
 
@@ -205,6 +206,39 @@ def test_what_is_found_is_used_up():
     index = build_index(observe([line(), helix()]), OPTICS)
     assert len(curves_of(grow(index, GrowParams()))) == 2
     assert len(curves_of(grow(index, GrowParams()))) == 0
+
+
+# ---- evidence --------------------------------------------------------------------------------------------------------
+
+
+def evidence_at(sweeps, place, taken=()):
+    """Mean evidence over 1 mm of an upright line through ``place``; ``taken``: curves whose observations are used up."""
+    index, points = build_index(sweeps, OPTICS), np.asarray(place) + np.arange(-0.5, 0.51, 0.1)[:, None] * np.array([0.0, 1.0, 0.0])
+    box, evidence = _box(GrowParams(), index), np.empty(len(points))
+    for curve in taken:
+        _claim(index, curve[::20], box, True)
+    _weigh(index, points, box, evidence)
+    return evidence.mean()
+
+
+def upright(x=0.0, z=0.0):
+    return line((x, 0, z), (0, 1, 0), 3.0)
+
+
+def test_a_camera_that_sees_a_hair_sharpest_elsewhere_is_less_evidence():
+    """Of three hairs 0.4 mm from a place, each before or behind it for one camera: their ribbons meet there, out of focus."""
+    angles = np.radians([30.0, 60.0, 90.0])
+    around = [upright(-0.4 * np.sin(a), 0.4 * np.cos(a)) for a in angles]
+    seen = Seen(angles=12)
+    true, chance = evidence_at(observe([upright()], seen), (0, 0, 0)), evidence_at(observe(around, seen), (0, 0, 0))
+    assert true > 8  # of 12 cameras
+    # three cameras and the three opposite ones see a ribbon there; each is half believed at 0.15 mm
+    assert chance < 0.3
+
+
+def test_what_another_curve_stands_on_is_less_evidence():
+    sweeps = observe([upright()], Seen(angles=12))
+    assert evidence_at(sweeps, (0, 0, 0), [upright()]) < 0.2 * evidence_at(sweeps, (0, 0, 0))
 
 
 # ---- the same every time ---------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from strandscope.core.joining import Curve, Meeting, bridged, chains, end_of, leading_to, meetings, misfit, once, paired, part, turned
+from strandscope.core.joining import Curve, Meeting, bridged, chains, end_of, leading_to, meetings, misfit, once, paired, part, passings, turned
 from strandscope.core.stops import Stop
 
 STEP_MM, PLACE_MM, TURN_DEG = 0.1, (0.02, 0.02), (2.0, 4.0)
@@ -112,3 +112,20 @@ def test_a_part_keeps_what_it_had_and_stops_where_it_was_cut():
     assert leading_to([curve], 0).points[-1, 1] == 0
     place, way = end_of(curve.points)
     np.testing.assert_allclose([*place, *way], [0, 4, 0, 0, 1, 0], atol=1e-9)
+
+
+def test_an_end_beside_another_curve_may_claim_the_rest_of_it():
+    piece, other = straight(0, 2), straight(0.5, 4, x=0.1)
+    (found,) = passings([piece, other], 0.2, 20.0, 8)
+    assert (found.end, found.other, found.onward) == (1, 1, True)
+    assert other.points[found.at, 1] == pytest.approx(2.0)
+    (found,) = passings([piece, turned(other)], 0.2, 20.0, 8)
+    assert not found.onward
+
+
+def test_ends_that_are_far_turned_or_near_the_others_end_claim_nothing():
+    piece = straight(0, 2)
+    level = Curve(straight(0, 4).points[:, [1, 0, 2]] + [-2.0, 2.0, 0.0], np.ones(41), (0, 0))
+    assert passings([piece, straight(0.5, 4, x=0.3)], 0.2, 20.0, 8) == []
+    assert passings([piece, level], 0.2, 20.0, 8) == []
+    assert passings([piece, straight(1.5, 4, x=0.1)], 0.2, 20.0, 8) == []

@@ -6,7 +6,8 @@ from scipy.spatial import cKDTree
 
 from strandscope.core.features import build_index
 from strandscope.core.grow import GrowParams, grow
-from strandscope.core.refine import RefineParams, bend_at_large, trace
+from strandscope.core.joining import Curve, bridged
+from strandscope.core.refine import RefineParams, _fit_all, _join, _uncross, _work, bend_at_large, trace
 
 from .known import OPTICS, Seen, helix, in_volume, line, observe, wave
 
@@ -94,6 +95,19 @@ def test_fibers_that_cross_do_not_exchange(apart_mm):
     assert len(found) == 2
     assert sorted(int(np.argmin([distances(t, points).max() for t in truths])) for points in found) == [0, 1]
     assert max(min(distances(t, points).max() for t in truths) for points in found) < 0.02
+
+
+def test_pieces_that_were_exchanged_go_back():
+    """Two fibers cross 0.1 mm apart; one curve goes from the first over to the second, and a piece of either is left over."""
+    first, second = (line((0, 0, z), (x, 1, 0))[::20] for z, x in ((0, 0.15), (0.1, -0.15)))
+    index = build_index(observe([line((0, 0, 0), (0.15, 1, 0)), line((0, 0, 0.1), (-0.15, 1, 0))], Seen(angles=24)), OPTICS)
+    work = _work(index, RefineParams(), GrowParams(), lambda function, items: list(map(function, items)))
+    parts = [first[20:39], first[42:60], second[20:39], second[42:60]]
+    wrong = bridged([Curve(parts[0], np.full(19, 9.0), (0, 0)), Curve(parts[3], np.full(18, 9.0), (0, 0))], 0.1)
+    curves = _fit_all([wrong, Curve(parts[1], np.full(18, 9.0), (0, 0)), Curve(parts[2], np.full(19, 9.0), (0, 0))], work)
+    found = _join(_fit_all(_uncross(curves, work), work), work)
+    worst = [min(distances(line((0, 0, z), (x, 1, 0)), c.points).max() for z, x in ((0, 0.15), (0.1, -0.15))) for c in found]
+    assert max(worst) < 0.03
 
 
 def test_clutter_alone_makes_no_hair():
