@@ -1,8 +1,8 @@
 """From grown pieces to fibers: each curve is fitted to all of its observations at once, loses the ends that nothing supports,
 and is joined to the piece of the same fiber beyond a place where it could not be seen.
 
-A curve is a smoothing spline in its plain form: a point every step, tied to the observations of every camera, with a price on
-the change of its curvature (Whittaker 1923), which is the price that makes the observations likeliest.
+A curve is a smoothing spline (``spline.py``): a point every step, tied to the observations of every camera, as stiff as makes the
+observations likeliest. What compares curves with each other is in ``joining.py``.
 """
 
 from collections.abc import Callable, Iterable
@@ -27,6 +27,7 @@ GROWING_SHARE = 0.6  # of the time of a round
 BEND_PX = 3.6  # sigma along the hair of what places a ridge, hair's width and slab included: it sees a bend from inside
 JOIN_PART, JOIN_BESIDE = 40, 2  # points of either curve that a join looks at, and those of the end itself
 BEND_STEPS = 4  # to either side: the length over which a curvature is told
+STRAIGHT = 1e-3  # 1/mm: hair is taken for no straighter
 UNCROSS_MM, UNCROSS_DEG = 0.2, 20.0  # how near an end must be to another curve to claim the rest of it, and how much turned
 UNCROSS_INNER = 12  # points to either side of the nearest, of which one is the weakest of the other curve
 LEAST_DIP = 0.3  # evidence: less is not told apart
@@ -143,7 +144,7 @@ def bend_at_large(curves: Iterable[tuple[np.ndarray, np.ndarray]], step_mm: floa
         bends.append(_bends(points, step_mm))
         seen.append(evidence[BEND_STEPS : BEND_STEPS + len(bends[-1])])
     bends, seen = np.concatenate(bends), np.concatenate(seen)
-    return float(np.sqrt(bends[seen >= np.median(seen)].mean())) if len(bends) else np.inf
+    return max(float(np.sqrt(bends[seen >= np.median(seen)].mean())), STRAIGHT) if len(bends) else np.inf
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -362,12 +363,12 @@ def _exchanged(curves: list[Curve], passing: Passing, work: _Work, bend: float) 
     if forward @ end_of(own.points)[1] < 0.5 * np.linalg.norm(forward):
         return 0.0, own, other
     both = bridged([own, beyond], work.box.step)
-    middle = slice(max(len(own.points) - JOIN_PART, 0), len(both.points) - max(len(beyond.points) - JOIN_PART, 0))
-    points = _fitted(work.index, np.ascontiguousarray(both.points[middle]), work.slab, work.params, bend)
-    evidence = np.empty(len(points))
+    before_it, after_it = (min(len(c.points), JOIN_PART) for c in (own, beyond))
+    middle = both.points[len(own.points) - before_it : len(both.points) - len(beyond.points) + after_it]
+    points, evidence = _fitted(work.index, np.ascontiguousarray(middle), work.slab, work.params, bend), np.empty(len(middle))
     _weigh(work.index, points, work.near, evidence)
-    way = slice(len(own.points) - middle.start - 5, len(points) - (middle.stop - (len(both.points) - len(beyond.points))) + 5)
-    return float(evidence[way].min() / max(other.evidence[dip], LEAST_DIP)), both, before
+    weakest = evidence[before_it - 5 : len(points) - after_it + 5].min()
+    return float(weakest / max(other.evidence[dip], LEAST_DIP)), both, before
 
 
 def _carry_on(curves: list[Curve], work: _Work) -> list[Curve]:

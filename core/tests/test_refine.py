@@ -140,3 +140,9 @@ def test_the_curvature_at_large_is_that_of_what_is_seen_well():
     expected = radius / (radius**2 + rise**2) / np.sqrt(2)
     curves = [(bent, np.full(len(bent), 8.0)), (rough, np.full(len(rough), 1.0))]
     assert bend_at_large(curves, step) == pytest.approx(expected, rel=0.02)
+
+
+def test_hair_without_a_bend_is_taken_for_nearly_straight():
+    straight = np.arange(0, 3, 0.1)[:, None] * np.array([[0.0, 1.0, 0.0]])
+    assert bend_at_large([(straight, np.ones(30))], 0.1) == pytest.approx(1e-3)
+    assert bend_at_large([(straight[:5], np.ones(5))], 0.1) == np.inf  # too short to tell: anything
