@@ -27,6 +27,7 @@ COL_STEPS, ROW_STEPS = 65536 // STRIP_PX, 65536 // BLOCK_PX  # units of the stor
 ANGLE_STEPS = 256  # units of the stored angle, over pi
 STRENGTH_STEPS = 12.0  # units of the stored strength, a factor of e
 STRENGTH_LEAST = 1e-3  # strength that is stored as 0
+BREADTH_STEPS, BREADTHS = 128, 256  # units of the stored breadth, a factor of e, and how many are told apart
 USED = 128  # added to the stored strength of a feature that a fiber has used up
 _STRENGTHS = STRENGTH_LEAST * np.exp(np.arange(USED) / STRENGTH_STEPS)
 
@@ -46,6 +47,7 @@ class SweepFeatures:
     frame: np.ndarray  # uint16
     angle: np.ndarray  # uint8: pi/256
     strength: np.ndarray  # uint8, logarithmic
+    breadth: np.ndarray  # uint8: 1/BREADTH_STEPS from -1 on; not in the Index, since only radii need it
 
     def __len__(self) -> int:
         return len(self.col)
@@ -57,12 +59,12 @@ def grid_shape(shape: tuple[int, int]) -> tuple[int, int]:
 
 
 def pack(angle_deg: float, positions_mm: Sequence[float], shape: tuple[int, int], photographs: Sequence) -> SweepFeatures:
-    """Sort the ridges of a sweep's photographs into cells. photographs: one with col, row, angle, strength (n,) a position."""
+    """Sort the ridges of a sweep's photographs into cells. photographs: one with col, row, angle, strength, breadth (n,) a position."""
     order = np.argsort(positions_mm, kind="stable")
     found = [photographs[i] for i in order]
     frame = np.repeat(np.arange(len(found), dtype=np.uint16), [len(f.col) for f in found])
-    col, row, angle, strength = (
-        np.concatenate([getattr(f, name) for f in found] or [[]]).astype(np.float64) for name in ("col", "row", "angle", "strength")
+    col, row, angle, strength, breadth = (
+        np.concatenate([getattr(f, name) for f in found] or [[]]).astype(np.float64) for name in ("col", "row", "angle", "strength", "breadth")
     )
     strips, blocks = grid_shape(shape)
     col, row = np.clip(col, 0, shape[1] - 1), np.clip(row, 0, shape[0] - 1)
@@ -81,6 +83,7 @@ def pack(angle_deg: float, positions_mm: Sequence[float], shape: tuple[int, int]
         frame=frame[order_in],
         angle=(np.rint(angle * (ANGLE_STEPS / np.pi)).astype(np.int64) % ANGLE_STEPS).astype(np.uint8)[order_in],
         strength=np.clip(level, 0, USED - 1).astype(np.uint8)[order_in],
+        breadth=np.clip(np.rint((breadth + 1) * BREADTH_STEPS), 0, BREADTHS - 1).astype(np.uint8)[order_in],
     )
 
 
@@ -114,7 +117,12 @@ def upright(ridges: Ridges, focus_mm: float, optics: Optics, shape: tuple[int, i
     col, row = to_pixel(u + (focus_mm - d) * along_u, v + (focus_mm - d) * along_v, *view)
     inside = (col >= 0) & (col <= shape[1] - 1) & (row >= 0) & (row <= shape[0] - 1)
     angle = (ridges.angle + np.radians(optics.tilt_deg)) % np.pi  # a hair along the axis becomes upright
-    return Ridges(*(np.asarray(a, np.float32)[inside] for a in (col, row, angle, ridges.strength)))
+    return Ridges(*(np.asarray(a, np.float32)[inside] for a in (col, row, angle, ridges.strength, ridges.breadth)))
+
+
+def breadth_of(stored):
+    """Breadth of the ``stored`` one."""
+    return stored / BREADTH_STEPS - 1
 
 
 def seen_by(features: SweepFeatures, sweep: Sweep, optics: Optics) -> SweepFeatures:
@@ -127,24 +135,25 @@ def seen_by(features: SweepFeatures, sweep: Sweep, optics: Optics) -> SweepFeatu
         return replace(features, angle_deg=sweep.angle_deg, positions_mm=positions)
     col, row = pixels(features)
     angle = features.angle * (np.pi / ANGLE_STEPS)
-    strength = STRENGTH_LEAST * np.exp(features.strength / STRENGTH_STEPS)
+    strength, breadth = STRENGTH_LEAST * np.exp(features.strength / STRENGTH_STEPS), breadth_of(features.breadth)
+    told = col, row, angle, strength, breadth
     order = np.argsort(features.frame, kind="stable")
     ends = np.searchsorted(features.frame[order], np.arange(len(positions) + 1))
     frames = (order[a:b] for a, b in pairwise(ends))
-    found = [upright(Ridges(col[i], row[i], angle[i], strength[i]), d, optics, features.shape) for i, d in zip(frames, positions, strict=True)]
+    found = [upright(Ridges(*(a[i] for a in told)), d, optics, features.shape) for i, d in zip(frames, positions, strict=True)]
     return pack(sweep.angle_deg, positions, features.shape, found)
 
 
 # ---- one file a sweep ------------------------------------------------------------------------------------------------
 
-_ARRAYS = ("positions_mm", "cells", "col", "row", "frame", "angle", "strength")
+RECORDS = ("positions_mm", "cells", "col", "row", "frame", "angle", "strength", "breadth")
 
 
 def save_features(path: Path, features: SweepFeatures) -> None:
     """Write one sweep as .npy arrays one after the other in one file (a header of angle and shape first), atomically."""
     with atomic(path) as part, open(part, "wb") as file:
         np.save(file, np.array([features.angle_deg, *features.shape], np.float64))
-        for name in _ARRAYS:
+        for name in RECORDS:
             np.save(file, getattr(features, name))
 
 
@@ -153,7 +162,7 @@ def load_features(path: Path) -> SweepFeatures:
     arrays = []
     try:
         with open(path, "rb") as file:
-            for _ in range(1 + len(_ARRAYS)):
+            for _ in range(1 + len(RECORDS)):
                 version = np.lib.format.read_magic(file)
                 read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
                 shape, _, dtype = read(file)

@@ -81,7 +81,6 @@ class GrowParams:
     min_support: float = 0.06  # a camera speaks when it has this share of the observations of a hair in full view
     memory_mm: float = 0.5  # the way grown that foretells the next step fades over this length
     foretold: tuple[float, float, float] = (0.02, 2.0, 0.2)  # trust in what is foretold: place (mm), direction (deg), curvature (1/mm)
-    radius_mm: float = 0.04
 
 
 @dataclass(frozen=True)
@@ -190,8 +189,8 @@ def _hair_frame(index, k, p, g):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _gather(index, k, frame, angle, bend, sag, box, hits, count):
-    """Observations of camera k in the box of a hair; returns the rows of hits (n, 7) there are now, filled from ``count`` on with
-    along, across (mm), turn (rad), weight, depth (mm), strength weighted by turn, and how free it is of other curves.
+    """Observations of camera k in the box of a hair; returns the rows of hits (n, 8) there are now, filled from ``count`` on with
+    along, across (mm), turn (rad), weight, depth (mm), strength weighted by turn, how free it is of other curves, and its number.
 
     bend, sag: curvature of the hair towards t and towards s (1/mm). What the hair itself bends away is taken from across, turn
     and depth. Observations deeper than half[1] have no weight, but tell how deep the camera sees the hair.
@@ -234,6 +233,7 @@ def _gather(index, k, frame, angle, bend, sag, box, hits, count):
                     y * y * strength_of(index.strength[i]),
                     free,
                 )
+                hits[count, 7] = i
                 count += 1
     return count
 
@@ -241,7 +241,7 @@ def _gather(index, k, frame, angle, bend, sag, box, hits, count):
 class _View(NamedTuple):
     """What the cameras say of a point: arrays over the sweeps."""
 
-    hits: np.ndarray  # (n, 7) observations, as ``_gather`` tells
+    hits: np.ndarray  # (n, 8) observations, as ``_gather`` tells
     ends: np.ndarray  # (S + 1,) int64: where each camera's observations begin
     across: np.ndarray  # (S, 3) t of each ribbon, object frame
     full: np.ndarray  # (S,) weight of the observations of a hair in full view; 0 for a camera that cannot see it
@@ -250,7 +250,7 @@ class _View(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _new_view(cameras):
-    return _View(np.empty((cameras * MAX_HITS, 7)), np.zeros(cameras + 1, np.int64), np.zeros((cameras, 3)), np.zeros(cameras), np.zeros(cameras))
+    return _View(np.empty((cameras * MAX_HITS, 8)), np.zeros(cameras + 1, np.int64), np.zeros((cameras, 3)), np.zeros(cameras), np.zeros(cameras))
 
 
 @njit(cache=True, nogil=True, fastmath=True)

@@ -20,7 +20,7 @@ import numpy as np
 from .capture import Capture, load_capture
 from .confidence import confidence, expected_error
 from .errors import CaptureError, StrandscopeError
-from .features import SweepFeatures, build_index, load_features, pack, save_features, seen_by, unpack, upright
+from .features import RECORDS, SweepFeatures, build_index, load_features, pack, save_features, seen_by, unpack, upright
 from .files import atomic
 from .geometry import Optics
 from .grow import Grown, GrowParams, grow
@@ -29,6 +29,7 @@ from .infill import InfillParams, infill
 from .match import Reach, sides_of, sightings
 from .paper import PaperParams, grow_paper
 from .progress import Progress, silent
+from .radius import RadiusParams, measured
 from .refine import RefineParams, trace
 from .ridges import RidgeParams, Ridges, detect, estimate
 from .rig.calibrate import (
@@ -64,6 +65,7 @@ class Parameters:
     ridges: RidgeParams = field(default_factory=RidgeParams)
     grow: GrowParams = field(default_factory=GrowParams)
     refine: RefineParams = field(default_factory=RefineParams)
+    radius: RadiusParams = field(default_factory=RadiusParams)
     paper: PaperParams | None = None  # not None: fibers are grown the paper's way, and ``grow`` and ``refine`` do not count
     hull: HullParams = field(default_factory=HullParams)
     infill: InfillParams | None = field(default_factory=InfillParams)  # None: captured fibers only
@@ -110,15 +112,17 @@ def reconstruct(
     index = build_index(sweeps, capture.optics)
     if parameters.paper is not None:
         grown, error = grow_paper(index, parameters.paper, progress), None
+        radius = np.full(len(grown.points_mm), parameters.paper.radius_mm, np.float32)
     else:
         grown = trace(index, parameters.grow, parameters.refine, workers, progress)
         error = expected_error(index, parameters.grow, parameters.refine, grown.points_mm, grown.offsets, grown.evidence, workers)
+        radius = measured(index, sweeps, grown.points_mm, grown.offsets, parameters.grow, parameters.refine, parameters.radius, workers)
     if len(grown.offsets) < 2:
         raise StrandscopeError(
             f"{capture.folder}: no fiber was found in {sum(map(len, sweeps))} features; expected hairs in focus in the photographs"
         )
     provenance = {"capture": capture.name, "version": VERSION, "parameters": asdict(parameters)}
-    strands = captured_strands(grown, error, parameters.grow, provenance)
+    strands = captured_strands(grown, error, radius, provenance)
     if parameters.infill is not None:
         strands = concatenate([strands, infill_strands(capture, work, sweeps, strands, parameters, workers, progress)], provenance)
     save_strands(out, strands)
@@ -245,6 +249,7 @@ def _made_from(capture: Capture, parameters: Parameters) -> str:
     stats = [(f, os.stat(capture.folder / f)) for s in capture.sweeps for f in s.files]
     told = {
         "version": VERSION,
+        "records": RECORDS,
         "optics": asdict(capture.optics),
         "sweeps": [asdict(sweep) for sweep in capture.sweeps],
         "files": [[name, stat.st_size, stat.st_mtime_ns] for name, stat in stats],
@@ -327,7 +332,7 @@ def _solved(
 
 def _reach(across_px: float, optics: Optics, parameters: Parameters) -> Reach:
     """Which observations tell of a point of a curve, when curves may lie ``across_px`` off."""
-    focus_mm = parameters.grow.radius_mm / np.tan(np.radians(optics.aperture_cone_deg) / 2)  # where the blur is as wide as a hair
+    focus_mm = parameters.radius.usual_mm / np.tan(np.radians(optics.aperture_cone_deg) / 2)  # where the blur is as wide as a hair
     far = across_px > ROUNDS_PX[-1]
     return Reach(
         along_mm=0.2,
@@ -385,13 +390,13 @@ def _summed_up(capture: Capture, errors: RigErrors, solution: Solution, biased: 
 # ---- fibers -> strands -----------------------------------------------------------------------------------------------
 
 
-def captured_strands(grown: Grown, error_mm: np.ndarray | None, params: GrowParams, provenance: dict) -> Strands:
-    """The grown curves as strands. Confidence follows from the expected error (N,); where that is not known (None, the paper's
-    method), it rises with the evidence for a point: 1 - exp(-evidence / 4)."""
+def captured_strands(grown: Grown, error_mm: np.ndarray | None, radius_mm: np.ndarray, provenance: dict) -> Strands:
+    """The grown curves as strands, with the radius (N,) of their points. Confidence follows from the expected error (N,); where
+    that is not known (None, the paper's method), it rises with the evidence for a point: 1 - exp(-evidence / 4)."""
     return Strands(
         points_mm=grown.points_mm,
         offsets=grown.offsets,
-        radius_mm=np.full(len(grown.points_mm), params.radius_mm, np.float32),
+        radius_mm=radius_mm,
         kind=np.full(len(grown.offsets) - 1, CAPTURED, np.uint8),
         confidence=(1 - np.exp(grown.evidence / -4.0) if error_mm is None else confidence(error_mm)).astype(np.float32),
         stops=grown.stops,

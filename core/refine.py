@@ -73,7 +73,7 @@ def _tie(index, points, box, normal, right):
     n = len(points)
     reach = min(4, (n - 1) // 2)
     inside = 0.5 * (BEND_PX * index.pitch) ** 2
-    hits = np.empty((MAX_HITS, 7))
+    hits = np.empty((MAX_HITS, 8))
     for j in range(n):
         g = points[min(j + 1, n - 1)] - points[max(j - 1, 0)]
         g /= np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])

@@ -57,6 +57,7 @@ class Ridges:
     row: np.ndarray
     angle: np.ndarray  # of the hair, from +u towards +v, [0, pi)
     strength: np.ndarray
+    breadth: np.ndarray  # logarithm of the answer of a filter for broader hair over that for finer hair; paper: 0
 
 
 def estimate(planes: Sequence[np.ndarray], params: RidgeParams) -> RidgeParams:
@@ -69,7 +70,7 @@ def estimate(planes: Sequence[np.ndarray], params: RidgeParams) -> RidgeParams:
     """
     light, top = [], []
     for plane in planes:
-        strength, _, _ = _measure(plane, replace(params, offset=float(plane.mean())))
+        strength, _, _, _ = _measure(plane, replace(params, offset=float(plane.mean())))
         around = ndimage.gaussian_filter(plane, LIGHT_PX)
         light.append(around[strength >= np.quantile(strength, 0.995)])
         top.append(np.quantile(around, 0.99))
@@ -90,17 +91,17 @@ def detect(plane: np.ndarray, params: RidgeParams) -> Ridges:
 
     Each is one pixel wide; col and row are moved along the normal to the crest.
     """
-    strength, angle, shift = _measure(plane, params)
+    strength, angle, shift, breadth = _measure(plane, params)
     rows, cols = np.nonzero(_kept(strength, angle, shift, params))
     angle, shift = angle[rows, cols], shift[rows, cols]
     # the normal of a hair at `angle` is (-sin, cos) in (u, v); rows run down, v runs up
     col, row = cols - shift * np.sin(angle), rows - shift * np.cos(angle)
-    return Ridges(*(np.asarray(a, np.float32) for a in (col, row, angle, strength[rows, cols])))
+    return Ridges(*(np.asarray(a, np.float32) for a in (col, row, angle, strength[rows, cols], breadth[rows, cols])))
 
 
 def response(plane: np.ndarray, params: RidgeParams) -> np.ndarray:
     """Strength (H, W) float32 of the ridge at each pixel of a channel plane (H, W), 0 where there is none; for pictures."""
-    strength, angle, shift = _measure(plane, params)
+    strength, angle, shift, _ = _measure(plane, params)
     return np.where(_kept(strength, angle, shift, params), strength, 0).astype(np.float32)
 
 
@@ -112,7 +113,7 @@ def _kept(strength, angle, shift, params):
 
 
 def _measure(plane, params):
-    """(strength, angle, shift), each (H, W) float32; strength is 0 off the crests, shift is along the normal in px."""
+    """(strength, angle, shift, breadth), each (H, W) float32; strength is 0 off the crests, shift is along the normal in px."""
     plane = np.ascontiguousarray(plane, np.float32)
     if params.offset is None:
         params = estimate([plane], params)
@@ -238,10 +239,10 @@ def _turned(best, fraction, bins):
 
 @njit(cache=True, fastmath=True, nogil=True)
 def _relative_peaks(blurred, filters, half, offset, low):
-    """The paper's relative peak M' of a blurred plane (H, W) and the angle and shift of its crests; three (H, W) arrays."""
+    """The paper's relative peak M' of a blurred plane (H, W) and the angle, shift and (not told) breadth of its crests; four (H, W) arrays."""
     height, width = blurred.shape
     strength = np.zeros((height, width), np.float32)
-    angle, shift = np.zeros_like(strength), np.zeros_like(strength)
+    angle, shift, breadth = np.zeros_like(strength), np.zeros_like(strength), np.zeros_like(strength)
     sums = np.empty((filters.shape[1], width - 2 * half), np.float32)
     values = np.empty((filters.shape[0], width - 2 * half), np.float32)
     for y in range(half, height - half):
@@ -259,7 +260,7 @@ def _relative_peaks(blurred, filters, half, offset, low):
             strength[y, x] = (m - below) / (below + offset)
             angle[y, x] = phi
             shift[y, x] = np.float32(0.5) * (m1 - m2) / (2 * m - m1 - m2)
-    return strength, angle, shift
+    return strength, angle, shift, breadth
 
 
 @njit(cache=True, fastmath=True, nogil=True)
@@ -316,7 +317,7 @@ def _finer(patch, bank, best):
 
 @njit(cache=True, fastmath=True, nogil=True)
 def _line_peaks(plane, filters, odd, narrow, wide, rim, light, offset, low):
-    """Crests of the line filters' response over (offset + light), their angle and shift; three (H, W) arrays.
+    """Crests of the line filters' response over (offset + light), their angle, shift and breadth; four (H, W) arrays.
 
     A short filter seeks them everywhere; where there is one, long filters tell its strength (``narrow``) and angle (``wide``).
     All banks but ``odd`` are folded; rim is half the width of the long ones.
@@ -324,7 +325,7 @@ def _line_peaks(plane, filters, odd, narrow, wide, rim, light, offset, low):
     height, width = plane.shape
     half = odd.shape[1] // 2
     strength = np.zeros((height, width), np.float32)
-    angle, shift = np.zeros_like(strength), np.zeros_like(strength)
+    angle, shift, breadth = np.zeros_like(strength), np.zeros_like(strength), np.zeros_like(strength)
     sums = np.empty((filters.shape[1], width - 2 * half), np.float32)
     values = np.empty((filters.shape[0], width - 2 * half), np.float32)
     patch = np.empty(narrow.shape[1], np.float32)
@@ -351,7 +352,8 @@ def _line_peaks(plane, filters, odd, narrow, wide, rim, light, offset, low):
             # the way to the crest along the normal of the bin, told along that of the angle
             strength[y, x] = value / (offset + light[y, x])
             shift[y, x] = step * np.cos(phi - angle[y, x])
-    return strength, angle, shift
+            breadth[y, x] = np.log(max(_dot(patch, wide[turned]), np.float32(0.1) * value) / value)
+    return strength, angle, shift, breadth
 
 
 @njit(cache=True, nogil=True)

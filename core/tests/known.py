@@ -92,6 +92,7 @@ class Seen:
     share: float = 1.0  # of the features that are kept
     seed: int = 0
     distance_mm: float = 330.0  # of the lens from the plane of focus
+    breadths: tuple[float, ...] = ()  # of the ridges of each curve, with an error of 0.3 each; none: all 0
 
     @property
     def optics(self) -> Optics:
@@ -119,12 +120,15 @@ def _sweep(curves, k, seen, hidden, rng) -> SweepFeatures:
     angle_deg = seen.turn_deg * k / seen.angles
     photographs = []
     for d in POSITIONS_MM:
-        found = [_crossings(c, ~hidden(c, k), angle_deg, d, seen) for c in curves]
-        col, row, angle, strength = np.concatenate([*found, _clutter(seen, rng)], axis=1)
+        found, clutter = [_crossings(c, ~hidden(c, k), angle_deg, d, seen) for c in curves], _clutter(seen, rng)
+        breadth = np.repeat([*seen.breadths, 0.0] if seen.breadths else np.zeros(len(curves) + 1), [f.shape[1] for f in (*found, clutter)])
+        col, row, angle, strength = np.concatenate([*found, clutter], axis=1)
         col, row = col + rng.normal(0, seen.noise_px, len(col)), row + rng.normal(0, seen.noise_px, len(col))
         angle = (angle + np.radians(rng.normal(0, seen.noise_deg, len(col)))) % np.pi
         inside = (col >= 0) & (col <= SHAPE[1] - 1) & (row >= 0) & (row <= SHAPE[0] - 1) & (rng.random(len(col)) < seen.share)
-        photographs.append(Ridges(*(np.float32(a[inside]) for a in (col, row, angle, strength))))
+        if seen.breadths:
+            breadth = breadth + rng.normal(0, 0.3, len(breadth))
+        photographs.append(Ridges(*(np.float32(a[inside]) for a in (col, row, angle, strength, breadth))))
     return pack(angle_deg, POSITIONS_MM, SHAPE, photographs)
 
 

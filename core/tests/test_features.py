@@ -20,7 +20,7 @@ IRREGULAR_MM = (-1.5, -1.31, -0.9, 0.02, 0.5, 0.51, 2.25)
 def some_ridges(count, shape=SHAPE, seed=0):
     rng = np.random.default_rng(seed)
     col, row = rng.uniform(0, shape[1] - 1, count), rng.uniform(0, shape[0] - 1, count)
-    return Ridges(*(np.float32(a) for a in (col, row, rng.uniform(0, np.pi, count), rng.uniform(0.05, 2, count))))
+    return Ridges(*(np.float32(a) for a in (col, row, rng.uniform(0, np.pi, count), rng.uniform(0.05, 2, count), rng.uniform(-0.9, 0.9, count))))
 
 
 def some_sweep(angle_deg=0.0, positions_mm=IRREGULAR_MM, each=120, seed=0, shape=SHAPE):
@@ -29,7 +29,7 @@ def some_sweep(angle_deg=0.0, positions_mm=IRREGULAR_MM, each=120, seed=0, shape
 
 
 def same_arrays(a, b):
-    return all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ("positions_mm", "cells", "col", "row", "frame", "angle", "strength"))
+    return all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ("positions_mm", "cells", "col", "row", "frame", "angle", "strength", "breadth"))
 
 
 # ---- an axis that leans ----------------------------------------------------------------------------------------------
@@ -45,7 +45,7 @@ def test_ridges_set_upright_are_where_an_upright_axis_has_them(tilt):
 
     def seen(optics):
         (col, row, _), (there, above, _) = pixels(points, 0, d, optics).T, pixels(along, 0, d, optics).T
-        return Ridges(col, row, np.arctan2(row - above, there - col) % np.pi, np.ones(200))
+        return Ridges(col, row, np.arctan2(row - above, there - col) % np.pi, np.ones(200), np.zeros(200))
 
     found, wanted = upright(seen(leaning), d, leaning, SHAPE), seen(OPTICS)
     assert len(found.col) == 200
@@ -56,7 +56,7 @@ def test_ridges_set_upright_are_where_an_upright_axis_has_them(tilt):
 
 
 def test_ridges_that_leave_the_photograph_are_dropped():
-    ridges = Ridges(*(np.float32(a) for a in ([149, 75], [0, 0], [1, 1], [1, 1])))
+    ridges = Ridges(*(np.float32(a) for a in ([149, 75], [0, 0], [1, 1], [1, 1], [0, 0])))
     kept = upright(ridges, 0.0, replace(OPTICS, tilt_deg=-2), SHAPE)  # the top of the picture moves to the right
     assert len(kept.col) == 1
 
@@ -122,7 +122,7 @@ def test_the_order_of_the_photographs_does_not_matter():
 
 def test_crests_on_the_rim_of_the_photograph_are_kept():
     at = np.float32([-0.5, SHAPE[1] - 0.5, 20, 20]), np.float32([10, 10, -0.5, SHAPE[0] - 0.5])
-    sweep = pack(0.0, [0.0], SHAPE, [Ridges(*at, np.float32([0, 1, 2, np.pi]), np.ones(4, np.float32))])
+    sweep = pack(0.0, [0.0], SHAPE, [Ridges(*at, np.float32([0, 1, 2, np.pi]), *np.ones((2, 4), np.float32))])
     u, v, _, angle = unpack(sweep, OPTICS)
     col, row = OPTICS.axis_col_px + u / OPTICS.pitch_mm, OPTICS.axis_row_px - v / OPTICS.pitch_mm
     assert len(sweep) == 4
