@@ -6,7 +6,7 @@ A capture is a folder with ``capture.json`` and photographs; nothing in it is re
 import json
 import os
 import re
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -15,7 +15,7 @@ import numpy as np
 from .errors import CaptureError
 from .files import atomic
 from .geometry import Optics
-from .raw import Mosaic, read_planes
+from .raw import Mosaic, read_planes, reduced
 
 FORMAT, VERSION = "strandscope-capture", 1
 FILE_NAME = "capture.json"
@@ -53,12 +53,17 @@ class Capture:
     truth: str | None = None
     mosaic: Mosaic | None = None
     unknown: dict = field(default_factory=dict)
+    averaged_px: int = 1  # pixels of a photograph, each way, that are one here; not in the file
 
     def planes(self, file: str, channels: str = "R") -> np.ndarray:
         """Channel planes (len(channels), H, W) float32 of one photograph, black 0, white 1; its gain is taken out. Raises CaptureError."""
-        planes = read_planes(self.folder / file, channels, self.mosaic)
+        planes = reduced(read_planes(self.folder / file, channels, self.mosaic), self.averaged_px)
         gain = self.gains.get(file, 1.0)
         return planes if gain == 1.0 else planes / np.float32(gain)
+
+    def reduced(self, by: int) -> "Capture":
+        """The same capture, of whose photographs ``by`` times ``by`` pixels are averaged to one."""
+        return self if by == 1 else replace(self, averaged_px=self.averaged_px * by, optics=self.optics.reduced(by))
 
     @cached_property
     def gains(self) -> dict[str, float]:
@@ -140,7 +145,7 @@ class _Reader:
             turntable=self._turntable(head["turntable"]) if head.get("turntable") else None,
             truth=self._file(head["truth"], "truth") if head.get("truth") else None,
             mosaic=self._mosaic(head["mosaic"]) if head.get("mosaic") else None,
-            unknown={k: v for k, v in head.items() if k not in {"format", "version"} | {f.name for f in fields(Capture)}},
+            unknown={k: v for k, v in head.items() if k not in {"format", "version"} | {f.name for f in fields(Capture) if f.name != "averaged_px"}},
         )
         self._all_there(capture)
         return capture

@@ -187,6 +187,7 @@ def figures(
     if len(strands.captured) == 0:
         raise StrandscopeError(f"{strands_path}: holds no captured curve; expected one at least, to look at")
     parameters = resolve(capture, _made_with(strands))
+    capture = capture.reduced(parameters.ridges.reduce)
     beside = Path(strands_path) if has_work_folder(capture, Path(strands_path), parameters) else out / "strands.npz"
     work = work_folder(capture, beside, parameters)
     sweeps = find_features(capture, work, parameters, workers, progress)

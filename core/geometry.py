@@ -10,7 +10,7 @@ functions (``njit(turn)``) and no formula is written twice. Sections and equatio
 section 3 and eq. (2) differ by a mirror, ours is eq. (2) with w = -z_paper.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,6 +26,11 @@ class Optics:
     aperture_cone_deg: float  # full angle of the cone of rays that meet in a point of the plane of focus
     tilt_deg: float = 0.0  # how far the upper end of the rotation axis leans to the right in the image
     tilt_towards_deg: float = 0.0  # and how far towards the camera
+
+    def reduced(self, by: int) -> "Optics":
+        """Those of photographs of which ``by`` times ``by`` pixels have become one."""
+        col, row = ((px - 0.5 * (by - 1)) / by for px in (self.axis_col_px, self.axis_row_px))
+        return replace(self, pitch_mm=by * self.pitch_mm, axis_col_px=col, axis_row_px=row)
 
 
 # ---- single coordinates: floats or arrays, also compiled into kernels ------------------------------------------------

@@ -106,6 +106,7 @@ def reconstruct(
     if calibration is not None:
         capture = load_errors(calibration).corrected(capture)
     parameters = resolve(capture, parameters)
+    capture = capture.reduced(parameters.ridges.reduce)
     work = work_folder(capture, Path(out), parameters)
     sweeps = find_features(capture, work, parameters, workers, progress)
     _check_memory(sweeps, memory_bytes)
@@ -216,7 +217,7 @@ _PRODUCTS = (_features_path, _blueness_path, _light_path)  # of the filter, a fi
 def resolve(capture: Capture, parameters: Parameters) -> Parameters:
     """Fill in what the parameters leave to be estimated from the photographs."""
     if parameters.ridges.offset is not None:
-        return parameters
+        return replace(parameters, ridges=replace(parameters.ridges, reduce=parameters.ridges.reduce or 1))
     photographs = [(sweep, file) for sweep in capture.sweeps for file in sweep.files]
     chosen = [photographs[i] for i in np.linspace(0, len(photographs) - 1, SAMPLED_PHOTOGRAPHS + 2).astype(int)[1:-1]]
     return replace(parameters, ridges=estimate([capture.planes(file)[0] for _, file in chosen], parameters.ridges))
@@ -285,7 +286,7 @@ def calibrate(
     until it stays. Raises CaptureError, StrandscopeError as ``reconstruct`` does, and where too few fibers are seen.
     """
     capture = load_capture(capture_path)
-    parameters = resolve(capture, parameters)
+    parameters = resolve(capture, replace(parameters, ridges=replace(parameters.ridges, reduce=1)))  # errors are told in whole pixels
     stated = replace(capture, optics=replace(capture.optics, tilt_deg=0.0, tilt_towards_deg=0.0))
     work = work_folder(stated, Path(out), parameters)
     sweeps = find_features(stated, work, parameters, workers, progress)

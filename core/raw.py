@@ -55,6 +55,16 @@ def read_planes(path: Path, channels: str = "R", mosaic: Mosaic | None = None) -
     return _raw_planes(path, channels)
 
 
+def reduced(plane: np.ndarray, by: int) -> np.ndarray:
+    """A channel plane (H, W), or several (C, H, W), of which ``by`` times ``by`` pixels have become one; what is left over at the
+    right and below is cut off. The middle of pixel i lies at ``by`` i + (by - 1) / 2."""
+    if by == 1:
+        return plane
+    rows, columns = plane.shape[-2] // by, plane.shape[-1] // by
+    whole = plane[..., : rows * by, : columns * by].reshape(*plane.shape[:-2], rows, by, columns, by)
+    return np.ascontiguousarray(whole.mean(axis=(-3, -1), dtype=np.float32))
+
+
 @dataclass(frozen=True)
 class Header:
     """What a photograph says of itself without its light being read."""

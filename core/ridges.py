@@ -18,16 +18,21 @@ image, from +u (right) towards +v (up), in [0, pi).
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from scipy import ndimage
 from threadpoolctl import ThreadpoolController
 
+from .raw import reduced
+
 BINS = 32  # orientations of a bank, over 180 degrees
+LEAST_PX = 100  # of a photograph's sides: it is not reduced any further
 LIGHT_PX = 8.0  # sigma of the Gaussian that tells the light around a pixel
 LIGHT_TO_OFFSET = 2.0  # c of the oriented operator, in parts of the light around clear hairs
 GRAIN_TO_OFFSET = 50.0  # and in standard deviations of the grain
+BROAD = 0.5  # breadth of hair that is twice as wide as the filters: it is still found; twice that is not
 BRIGHT = 0.6  # of the light of a photograph's brightest places: where its grain is measured
 TURNED_LOSS = 0.5  # answer of a long filter that is a bin or two off, in parts of the right one's
 BESIDE_PX, TURN_DEG = 0.8, 20.0  # how far the next pixel of a run may lie beside the way of one, and be turned
@@ -38,6 +43,7 @@ class RidgeParams:
     """What counts as a ridge. Lengths in pixels of the channel plane, light in parts of white."""
 
     operator: str = "oriented"  # or "paper"
+    reduce: int | None = None  # pixels each way that are averaged to one before all else, where hair is wide; None: estimated
     low: float = 0.011  # strength of a ridge pixel that may be part of a run (paper: that continues a ridge)
     high: float = 0.022  # mean strength of a run (paper: strength that begins a ridge)
     run_px: int = 7  # oriented: ridge pixels in a run
@@ -61,21 +67,46 @@ class Ridges:
 
 
 def estimate(planes: Sequence[np.ndarray], params: RidgeParams) -> RidgeParams:
-    """``params`` with the offset c that suits a capture: in proportion to the light around its clearest hairs, and to the
-    grain of its photographs.
+    """``params`` with the reduction and the offset c that suit a capture, where they are not given.
 
-    planes: some photographs' channel planes (H, W). A capture twice as bright gives the same ridges. Grain is that of bright
-    places: it grows with light, and there may be much background. The factors are those that leave less than one false ridge in 10,000
-    pixels of blurred hair on two dense locks, one with six times the grain of the other.
+    planes: some photographs' channel planes (H, W). They are reduced as long as hair stays twice as broad as the filters are made for.
+    The offset is in proportion to the light around the clearest hairs, and to the grain of the photographs: a capture twice as
+    bright gives the same ridges. Grain is that of bright places: it grows with light, and there may be much background. The factors
+    are those that leave less than one false ridge in 10,000 pixels of blurred hair on two dense locks, one with six times the grain
+    of the other.
     """
-    light, top = [], []
+    reduce = params.reduce or 1
+    told = _clearest([reduced(plane, reduce) for plane in planes], params)
+    while params.reduce is None and min(planes[0].shape) >= 2 * reduce * LEAST_PX:
+        smaller = _clearest([reduced(plane, 2 * reduce) for plane in planes], params)
+        if smaller.breadth < BROAD:
+            break
+        reduce, told = 2 * reduce, smaller
+    offset = params.offset
+    if offset is None:
+        offset = LIGHT_TO_OFFSET * told.light + GRAIN_TO_OFFSET * told.grain
+    return replace(params, reduce=reduce, offset=float(offset))
+
+
+class _Clearest(NamedTuple):
+    """What the clearest hairs of some photographs are like."""
+
+    breadth: float
+    light: float  # around them
+    grain: float
+
+
+def _clearest(planes: Sequence[np.ndarray], params: RidgeParams) -> _Clearest:
+    breadths, light, top = [], [], []
     for plane in planes:
-        strength, _, _, _ = _measure(plane, replace(params, offset=float(plane.mean())))
+        strength, _, _, breadth = _measure(plane, replace(params, offset=float(plane.mean())))
         around = ndimage.gaussian_filter(plane, LIGHT_PX)
-        light.append(around[strength >= np.quantile(strength, 0.995)])
+        clear = strength >= np.quantile(strength, 0.995)
+        breadths.append(breadth[clear])
+        light.append(around[clear])
         top.append(np.quantile(around, 0.99))
     grain = [noise(plane, plane_top) for plane, plane_top in zip(planes, top, strict=True) if plane_top >= BRIGHT * max(top)]
-    return replace(params, offset=float(LIGHT_TO_OFFSET * np.median(np.concatenate(light)) + GRAIN_TO_OFFSET * np.median(grain)))
+    return _Clearest(float(np.median(np.concatenate(breadths))), float(np.median(np.concatenate(light))), float(np.median(grain)))
 
 
 def noise(plane: np.ndarray, top: float) -> float:
@@ -116,7 +147,7 @@ def _measure(plane, params):
     """(strength, angle, shift, breadth), each (H, W) float32; strength is 0 off the crests, shift is along the normal in px."""
     plane = np.ascontiguousarray(plane, np.float32)
     if params.offset is None:
-        params = estimate([plane], params)
+        params = estimate([plane], replace(params, reduce=1))
     with _blas().limit(limits=1):  # a row is too little for two threads, which wait for each other ten times as long
         return _measure_alone(plane, params)
 

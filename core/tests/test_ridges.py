@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from strandscope.core.geometry import to_image
+from strandscope.core.raw import reduced
 from strandscope.core.ridges import BINS, LIGHT_PX, RidgeParams, detect, estimate, gabor_bank, line_banks, response
 
-from .known import across, along, drawn_line, turn_between
+from .known import OPTICS, across, along, drawn_line, turn_between
 
 SIDE = 64
 MIDDLE = (SIDE - 1) / 2
@@ -424,3 +426,28 @@ def test_angles_are_angles_even_of_noise():
     ridges = detect(plane, RidgeParams(low=1e-4, high=1e-4, run_px=1, offset=0.1))
     assert len(ridges.col) > 500
     assert np.all((ridges.angle >= 0) & (ridges.angle < np.pi + 1e-6))
+
+
+@pytest.mark.parametrize(("times", "reduce"), [(1, 1), (2, 1), (4, 2)])
+def test_photographs_of_wide_hair_are_reduced_until_it_is_twice_as_wide_as_the_filters(times, reduce):
+    rng = np.random.default_rng(4)
+    shape = (120 * times, 140 * times)
+    plane = np.full(shape, 0.05)
+    for angle, row in zip(rng.uniform(0, np.pi, 6), rng.uniform(20, 100, 6), strict=True):
+        plane += drawn_line(shape, angle, (70 * times, row * times), 2.8 * times, 0.5 * times, rounded=True)
+    plane = (plane + rng.normal(0, GRAIN, shape)).astype(np.float32)
+    assert estimate([plane], RidgeParams()).reduce == reduce
+    assert estimate([plane], RidgeParams(reduce=1)).reduce == 1
+
+
+def test_a_reduced_photograph_shows_the_same_places():
+    optics = replace(OPTICS, axis_col_px=73.0, axis_row_px=40.0)
+    plane = np.zeros((90, 121), np.float32)
+    plane[30:33, 60:63] = 1.0
+    small = reduced(plane, 3)
+    assert small.shape == (30, 40)
+    assert np.argwhere(small == 1).tolist() == [[10, 20]]
+    at = [to_image(float(c), float(r), o.pitch_mm, o.axis_col_px, o.axis_row_px) for c, r, o in ((61, 31, optics), (20, 10, optics.reduced(3)))]
+    assert at[0] == pytest.approx(at[1])
+    colours = reduced(np.stack([plane, 2 * plane]), 3)
+    np.testing.assert_allclose(colours, [small, 2 * small])
