@@ -190,6 +190,7 @@ class Index(NamedTuple):
     first: np.ndarray  # (sweeps + 1,) int64: first feature of each sweep
     first_cell: np.ndarray  # (sweeps + 1,) int64
     positions: np.ndarray  # float64, of all sweeps
+    positions_f32: np.ndarray  # the same, for kernels that look at many features
     first_position: np.ndarray  # (sweeps + 1,) int64
     cos: np.ndarray  # (sweeps,) of the turntable angle
     sin: np.ndarray
@@ -213,6 +214,7 @@ def build_index(sweeps: Sequence[SweepFeatures], optics: Optics) -> Index:
         first=_starts([len(s) for s in sweeps]),
         first_cell=_starts([len(s.cells) for s in sweeps]),
         positions=np.concatenate([s.positions_mm for s in sweeps]),
+        positions_f32=np.concatenate([s.positions_mm for s in sweeps]).astype(np.float32),
         first_position=_starts([len(s.positions_mm) for s in sweeps]),
         cos=np.cos(theta),
         sin=np.sin(theta),

@@ -14,7 +14,8 @@ import numpy as np
 from numba import njit
 
 from .features import BREADTHS, Index, SweepFeatures, breadth_of, strength_of
-from .grow import MAX_HITS, GrowParams, _Box, _gather, _hair_frame, _sees
+from .grow import GrowParams
+from .look import BOW, Box, chord, gather, hair_frame, new_hits, sees
 from .refine import RefineParams, _work
 
 
@@ -33,22 +34,19 @@ class RadiusParams:
 @njit(cache=True, nogil=True, fastmath=True)
 def _tally(index, k, breadth, points, box, tally):
     """Add the breadths of what sweep k sees of a curve (n, 3) to tally (BREADTHS,), each by its weight and strength squared."""
-    hits = np.empty((MAX_HITS, 8))
-    n = len(points)
-    for j in range(n):
-        g = points[min(j + 1, n - 1)] - points[max(j - 1, 0)]
-        g /= np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
-        frame, angle, size = _hair_frame(index, k, points[j], g)
-        if size < 0.2 or not _sees(index, k, frame[0, 0], frame[0, 1], frame[0, 2]):
+    hits = new_hits(1)
+    for j in range(len(points)):
+        frame = hair_frame(index, k, points[j], chord(points, j))
+        if frame.size < 0.2 or not sees(index, k, frame.p[0], frame.p[1], frame.p[2]):
             continue
-        for hit in hits[: _gather(index, k, frame, angle, 0.0, 0.0, box, hits, 0)]:
-            x = hit[1] / box.sigma
-            x = max(1 - 0.207 * x * x, 0.0)
-            i = int(hit[7])
-            tally[breadth[i - index.first[k]]] += hit[3] * x * x * strength_of(index.strength[i]) ** 2
+        for i in range(gather(index, k, frame, 0.0, 0.0, box, hits, 0)):
+            x = hits.across[i] / box.sigma
+            x = max(1 - BOW * x * x, 0.0)
+            n = hits.number[i]
+            tally[breadth[n - index.first[k]]] += hits.weight[i] * x * x * strength_of(index.strength[n]) ** 2
 
 
-def breadths(index: Index, sweeps: Sequence[SweepFeatures], points_mm: np.ndarray, offsets: np.ndarray, box: _Box, workers: int = 1) -> np.ndarray:
+def breadths(index: Index, sweeps: Sequence[SweepFeatures], points_mm: np.ndarray, offsets: np.ndarray, box: Box, workers: int = 1) -> np.ndarray:
     """Median breadth (M,) of the ridges along each curve of points_mm (N, 3), NaN where there are none. One sweep's breadths are in
     memory at a time, and nothing of it depends on the number of ``workers``."""
     curves = [np.ascontiguousarray(points_mm[a:b], float) for a, b in pairwise(offsets)]

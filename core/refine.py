@@ -15,8 +15,9 @@ from scipy.spatial import cKDTree
 
 from .features import USED, Index
 from .geometry import turn_back
-from .grow import MAX_HITS, Grown, GrowParams, _Box, _box, _claim, _fit, _gather, _grow_end, _hair_frame, _look, _new_view, _sees, find_seeds, grow
+from .grow import Grown, GrowParams, box_of, claims_of, find_seeds, grow, grow_end
 from .joining import Curve, Meeting, Passing, bridged, chains, end_of, leading_to, meetings, once, paired, part, passings, turned
+from .look import BOW, Box, chord, claimed, fit, gather, hair_frame, look, new_hits, new_view, sees
 from .progress import Progress, silent
 from .spline import Stiffness, across, covariance, smoothed, stiffness
 from .stops import Stop
@@ -73,10 +74,9 @@ def _tie(index, points, box, normal, right):
     n = len(points)
     reach = min(4, (n - 1) // 2)
     inside = 0.5 * (BEND_PX * index.pitch) ** 2
-    hits = np.empty((MAX_HITS, 8))
+    hits = new_hits(1)
     for j in range(n):
-        g = points[min(j + 1, n - 1)] - points[max(j - 1, 0)]
-        g /= np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+        g = chord(points, j)
         bend = np.zeros(3)
         if reach > 0:
             m = min(max(j, reach), n - 1 - reach)
@@ -86,29 +86,29 @@ def _tie(index, points, box, normal, right):
             for d in range(3):
                 normal[j, c, d] = STIFF * g[c] * g[d]
         for k in range(len(index.cos)):
-            frame, angle, size = _hair_frame(index, k, points[j], g)
-            if size < 0.2 or not _sees(index, k, frame[0, 0], frame[0, 1], frame[0, 2]):
+            frame = hair_frame(index, k, points[j], g)
+            if frame.size < 0.2 or not sees(index, k, frame.p[0], frame.p[1], frame.p[2]):
                 continue
-            count = _gather(index, k, frame, angle, 0.0, 0.0, box, hits, 0)
+            count = gather(index, k, frame, 0.0, 0.0, box, hits, 0)
             s = r = 0.0
             for i in range(count):
-                x = hits[i, 1] / box.sigma
-                x = max(1 - 0.207 * x * x, 0.0)
-                w = hits[i, 3] * x * x
+                x = hits.across[i] / box.sigma
+                x = max(1 - BOW * x * x, 0.0)
+                w = hits.weight[i] * x * x
                 s += w
-                r += w * hits[i, 1]
+                r += w * hits.across[i]
             if s < 1e-6:
                 continue
             share, t = min(s / box.full_support, 1.0), np.empty(3)
-            t[0], t[1], t[2] = _turn_back(frame[3, 0], frame[3, 1], frame[3, 2], index.cos[k], index.sin[k])
-            place = r / s - inside * (t[0] * bend[0] + t[1] * bend[1] + t[2] * bend[2]) / (size * size)
+            t[0], t[1], t[2] = _turn_back(frame.t[0], frame.t[1], frame.t[2], index.cos[k], index.sin[k])
+            place = r / s - inside * (t[0] * bend[0] + t[1] * bend[1] + t[2] * bend[2]) / (frame.size * frame.size)
             for c in range(3):
                 right[j, c] += share * place * t[c]
                 for d in range(3):
                     normal[j, c, d] += share * t[c] * t[d]
 
 
-def _ties(index: Index, points: np.ndarray, box: _Box, params: RefineParams, bend: float) -> tuple[np.ndarray, np.ndarray, Stiffness]:
+def _ties(index: Index, points: np.ndarray, box: Box, params: RefineParams, bend: float) -> tuple[np.ndarray, np.ndarray, Stiffness]:
     """What ``_tie`` says of points (n, 3), in units of its errors, and the stiffness that makes it likeliest; ``bend`` is the curvature
     (1/mm) of the hair at large."""
     normal, right = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
@@ -119,7 +119,7 @@ def _ties(index: Index, points: np.ndarray, box: _Box, params: RefineParams, ben
     return normal, right, max(choices, key=lambda stiff: smoothed(points, normal, right, stiff)[1])
 
 
-def _fitted(index: Index, points: np.ndarray, box: _Box, params: RefineParams, bend: float) -> np.ndarray:
+def _fitted(index: Index, points: np.ndarray, box: Box, params: RefineParams, bend: float) -> np.ndarray:
     """Points (n, 3) of a curve fitted to its observations, as stiff as these make likely (empirical Bayes)."""
     for _ in range(params.rounds):
         normal, right, stiff = _ties(index, points, box, params, bend)
@@ -151,17 +151,16 @@ def bend_at_large(curves: Iterable[tuple[np.ndarray, np.ndarray]], step_mm: floa
 def _weigh(index, points, box, evidence):
     """Evidence (n,) of each point (n, 3) of a curve that is already where it should be."""
     n = len(points)
-    view, free = _new_view(len(index.cos)), (1e9, 1e9, 1e9)
+    view, free = new_view(len(index.cos)), (1e9, 1e9, 1e9)
     for j in range(n):
         a, b = max(j - 2, 0), min(j + 2, n - 1)
         m = (a + b) // 2
-        g = points[min(j + 1, n - 1)] - points[max(j - 1, 0)]
-        g /= np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+        g = chord(points, j)
         half = 0.5 * (b - a) * box.step
         bend = (points[a] + points[b] - 2 * points[m]) / (half * half) if b - a == 4 else np.zeros(3)
         bend -= g * (g[0] * bend[0] + g[1] * bend[1] + g[2] * bend[2])
-        _look(index, points[j], g, bend, box, view)
-        _, evidence[j], _, _, _ = _fit(view, index.around, g, box, 1.0, free)
+        look(index, points[j], g, bend, box, view)
+        _, evidence[j], _, _, _ = fit(view, index.around, g, box, 1.0, free)
 
 
 # ---- growing on ------------------------------------------------------------------------------------------------------
@@ -189,7 +188,7 @@ def _grow_on(index, points, box, state, evidence):
             way = state[i - 1, 3:6] + box.step * bend
             state[i, 3:6] = way / np.sqrt(np.sum(way**2))
         evidence[i] = 4.0
-    filled, stop = _grow_end(index, box, _new_view(len(index.cos)), state, evidence, known, 1.0)
+    filled, stop = grow_end(index, box, new_view(len(index.cos)), state, evidence, known, 1.0)
     return known, filled, stop
 
 
@@ -202,9 +201,10 @@ class _Work:
 
     index: Index
     params: RefineParams
-    box: _Box  # as for growing
-    slab: _Box  # half a step to either side
-    near: _Box  # the length over which evidence is weighed
+    box: Box  # as for growing
+    slab: Box  # half a step to either side
+    near: Box  # the length over which evidence is weighed
+    claims: Box  # what a step uses up
     each: Callable  # each(function, items): a list, on all threads
 
 
@@ -245,15 +245,16 @@ def _part_of(progress: Progress, number: int, rounds: int) -> Progress:
 
 
 def _work(index: Index, params: RefineParams, grow_params: GrowParams, each: Callable) -> _Work:
-    box, fit = _box(grow_params, index), _box(replace(grow_params, sigma_px=params.fit_sigma[0], sigma_focus_mm=params.fit_sigma[1]), index)
+    box, fit = box_of(grow_params, index), box_of(replace(grow_params, sigma_px=params.fit_sigma[0], sigma_focus_mm=params.fit_sigma[1]), index)
     wide = 1.5 * index.pitch
     slab, near = (mm / (2 * box.half[0]) for mm in (box.step, params.near_mm))  # of the length of the box
     return _Work(
         index=index,
         params=params,
         box=box,
-        slab=fit._replace(half=(0.5 * box.step, box.half[1], wide), full_support=slab * fit.full_support),
+        slab=fit._replace(half=(0.5 * box.step, box.half[1], wide), deep=box.half[1], full_support=slab * fit.full_support),
         near=box._replace(half=(0.5 * params.near_mm, box.half[1], wide), full_support=near * box.full_support),
+        claims=claims_of(grow_params, box),
         each=each,
     )
 
@@ -266,8 +267,8 @@ def _curves(grown: Grown) -> list[Curve]:
 def _mark(curves: list[Curve], work: _Work) -> None:
     """Mark the observations that curves stand on as used, and no others."""
     work.index.strength[:] &= USED - 1
-    for curve in curves:
-        _claim(work.index, curve.points, work.box, True)
+    for numbers in work.each(lambda curve: claimed(work.index, curve.points, work.claims), curves):
+        work.index.strength[numbers] |= USED
 
 
 def _at_large(curves: list[Curve], work: _Work) -> float:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from strandscope.core.features import build_index
-from strandscope.core.grow import GrowParams, Stop, _box, _claim, grow, solve_direction
+from strandscope.core.features import USED, build_index
+from strandscope.core.grow import GrowParams, Stop, box_of, claims_of, grow, solve_direction
+from strandscope.core.look import claimed
 from strandscope.core.refine import _weigh
 
 from .known import OPTICS, Seen, helix, in_volume, line, observe, wave
@@ -214,9 +215,9 @@ def test_what_is_found_is_used_up():
 def evidence_at(sweeps, place, taken=()):
     """Mean evidence over 1 mm of an upright line through ``place``; ``taken``: curves whose observations are used up."""
     index, points = build_index(sweeps, OPTICS), np.asarray(place) + np.arange(-0.5, 0.51, 0.1)[:, None] * np.array([0.0, 1.0, 0.0])
-    box, evidence = _box(GrowParams(), index), np.empty(len(points))
+    box, evidence = box_of(GrowParams(), index), np.empty(len(points))
     for curve in taken:
-        _claim(index, curve[::20], box, True)
+        index.strength[claimed(index, curve[::20], claims_of(GrowParams(), box))] |= USED
     _weigh(index, points, box, evidence)
     return evidence.mean()
 
