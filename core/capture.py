@@ -52,6 +52,7 @@ class Capture:
     turntable: Turntable | None = None
     truth: str | None = None
     mosaic: Mosaic | None = None
+    features: str | None = None  # folder with features in place of photographs, which need not be there
     unknown: dict = field(default_factory=dict)
     averaged_px: int = 1  # pixels of a photograph, each way, that are one here; not in the file
 
@@ -72,7 +73,10 @@ class Capture:
 
     @cached_property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of a channel plane, read off the first photograph."""
+        """Rows and columns of a channel plane, read off the first photograph, or the first features."""
+        if self.features:
+            with open(self.folder / self.features / "sweep_000.features", "rb") as file:
+                return tuple(int(n) for n in np.load(file)[1:])
         return self.planes(self.sweeps[0].files[0]).shape[1:]
 
     @property
@@ -105,8 +109,9 @@ def save_capture(capture: Capture) -> Path:
     for key in ("turntable", "mosaic"):
         if getattr(capture, key) is not None:
             head[key] = asdict(getattr(capture, key))
-    if capture.truth:
-        head["truth"] = capture.truth
+    for key in ("truth", "features"):
+        if getattr(capture, key):
+            head[key] = getattr(capture, key)
     path = capture.folder / FILE_NAME
     with atomic(path) as part:
         part.write_text(json.dumps(head | capture.unknown, indent=1), encoding="utf-8")
@@ -145,6 +150,7 @@ class _Reader:
             turntable=self._turntable(head["turntable"]) if head.get("turntable") else None,
             truth=self._file(head["truth"], "truth") if head.get("truth") else None,
             mosaic=self._mosaic(head["mosaic"]) if head.get("mosaic") else None,
+            features=self._file(head["features"], "features") if head.get("features") else None,
             unknown={k: v for k, v in head.items() if k not in {"format", "version"} | {f.name for f in fields(Capture) if f.name != "averaged_px"}},
         )
         self._all_there(capture)
@@ -218,7 +224,12 @@ class _Reader:
         return name
 
     def _all_there(self, capture: Capture) -> None:
-        for sweep in capture.sweeps:
+        for i, sweep in enumerate(capture.sweeps):
+            if capture.features:
+                path = capture.folder / capture.features / f"sweep_{i:03d}.features"
+                if not path.is_file():
+                    raise CaptureError(f"{self.path}: {len(capture.sweeps)} sweeps have features in place of photographs; missing {path.name}")
+                continue
             missing = [name for name in sweep.files if not os.path.isfile(capture.folder / name)]  # False for a name that is too long, too
             if missing:
                 raise CaptureError(

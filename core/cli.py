@@ -220,6 +220,7 @@ def main_group():
 )
 @click.option("--fibers", type=click.IntRange(1), help="Number of hairs, in place of the scale's own.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Another number gives another lock of the same kind.")
+@click.option("--features-only", is_flag=True, help="No photographs, but what the filter would find in them: a whole capture in minutes.")
 @click.option("--misaligned", is_flag=True, help="Photograph with a rig that is off in all of the following ways at once.")
 @click.option("--axis-off-px", type=float, metavar="PX", help="The turntable's axis is this much right of where capture.json says.  [misaligned: 3]")
 @click.option("--tilt-deg", type=float, metavar="DEG", help="The axis leans to the right in the image.  [misaligned: 0.2]")
@@ -231,7 +232,7 @@ def main_group():
 @click.option("--gain-drift", type=float, metavar="PARTS", help="Photographs gain light from the first to the last of a sweep.  [misaligned: 0.05]")
 @common
 @click.pass_obj
-def simulate(session, out, style, scale, fibers, seed, misaligned, **off):
+def simulate(session, out, style, scale, fibers, seed, features_only, misaligned, **off):
     """Photograph hair that is known: make a capture in the folder OUT from simulated fibers.
 
     Leaves raw photographs (DNG), capture.json, and truth.npz, which says where every hair really is, so that a
@@ -241,12 +242,19 @@ def simulate(session, out, style, scale, fibers, seed, misaligned, **off):
     Example:
       strandscope simulate lock --style wavy --scale tiny
       strandscope simulate crooked --scale tiny --misaligned
+      strandscope simulate switch --scale paper --features-only
     """
     from . import simulate as simulator
 
     rig = simulator.MISALIGNED if misaligned else simulator.Misalignment()
     rig = replace(rig, **{name.replace("_off", ""): value for name, value in off.items() if value is not None})
-    simulator.simulate(out, simulator.SimulateParams(style, scale, fibers, seed, misalignment=rig), session.report)
+    params = simulator.SimulateParams(style, scale, fibers, seed, misalignment=rig)
+    if features_only:
+        from .simulate_features import simulate_features
+
+        simulate_features(out, params, progress=session.report)
+    else:
+        simulator.simulate(out, params, session.report)
     session.report.done(out)
 
 

@@ -31,6 +31,7 @@ class GroomParams:
     spacing_mm: float = 0.1  # between points of the result, at most
     chord_error_mm: float = 0.0008  # a chord of the result stays this close to the smooth curve
     rounds: int = 4000  # of pushing apart, at most
+    overlap_mm: float = 0.0  # that may be left between two fibers; the last of it takes the longest
 
 
 @dataclass(frozen=True)
@@ -247,7 +248,7 @@ def _push_apart(controls: np.ndarray, radii: np.ndarray, params: GroomParams) ->
             near = _near_segments(points, offsets, 2 * radii.max() + params.clearance_mm + skin)
             built = points
         moves, worst = _moves(points, *near, len(places), radii, params.clearance_mm, first, weights, fibers, count)
-        if worst <= 0.5 * params.clearance_mm:  # the last of it takes the longest
+        if worst <= max(0.5 * params.clearance_mm, params.clearance_mm + params.overlap_mm if params.overlap_mm else 0.0):
             return controls
         controls = controls + moves
         if turn < 100:

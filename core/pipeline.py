@@ -134,7 +134,7 @@ def reconstruct(
 
 
 def find_features(capture: Capture, work: Path, parameters: Parameters, workers: int, progress: Progress) -> list[SweepFeatures]:
-    """The features of every sweep, filtered from the photographs unless ``work`` has them from a run before."""
+    """The features of every sweep, filtered from the photographs unless ``work`` has them from a run before, or the capture itself."""
     missing = [i for i in range(len(capture.sweeps)) if not all(path(work, i).is_file() for path in _PRODUCTS)]
     shape, total = capture.shape, sum(len(capture.sweeps[i].files) for i in missing)
     jobs = [(capture, file, parameters, shape) for i in missing for file in capture.sweeps[i].files]
@@ -150,12 +150,12 @@ def find_features(capture: Capture, work: Path, parameters: Parameters, workers:
                 blues.append(blue)
                 lights.append(lit)
                 done += 1
-            for path, pictures in ((_blueness_path, blues), (_light_path, lights)):
+            for path, pictures in ((blueness_path, blues), (light_path, lights)):
                 with atomic(path(work, i)) as part:
                     np.save(part, np.stack(pictures))
-            save_features(_features_path(work, i), pack(sweep.angle_deg, sweep.positions_mm, shape, ridges))
+            save_features(features_path(work, i), pack(sweep.angle_deg, sweep.positions_mm, shape, ridges))
     progress("finding ridges", total, total)
-    return [load_features(_features_path(work, i)) for i in range(len(capture.sweeps))]
+    return [load_features(features_path(work, i)) for i in range(len(capture.sweeps))]
 
 
 def _filter(job: tuple[Capture, str, Parameters, tuple[int, int]]) -> tuple[Ridges, np.ndarray, np.ndarray]:
@@ -199,23 +199,28 @@ def _check_memory(sweeps: list[SweepFeatures], memory_bytes: int) -> None:
         raise StrandscopeError(f"{sum(map(len, sweeps))} features need about {told} of memory; {allowed} are allowed (--memory), give more")
 
 
-def _features_path(work: Path, i: int) -> Path:
+def features_path(work: Path, i: int) -> Path:
+    """Where a work folder has the features of sweep i."""
     return work / f"sweep_{i:03d}.features"
 
 
-def _blueness_path(work: Path, i: int) -> Path:
+def blueness_path(work: Path, i: int) -> Path:
+    """Where a work folder has the pictures of blueness of sweep i."""
     return work / f"sweep_{i:03d}.blueness.npy"
 
 
-def _light_path(work: Path, i: int) -> Path:
+def light_path(work: Path, i: int) -> Path:
+    """Where a work folder has the pictures of light of sweep i."""
     return work / f"sweep_{i:03d}.light.npy"
 
 
-_PRODUCTS = (_features_path, _blueness_path, _light_path)  # of the filter, a file each for every sweep
+_PRODUCTS = (features_path, blueness_path, light_path)  # of the filter, a file each for every sweep
 
 
 def resolve(capture: Capture, parameters: Parameters) -> Parameters:
     """Fill in what the parameters leave to be estimated from the photographs."""
+    if capture.features:
+        return replace(parameters, ridges=replace(parameters.ridges, offset=0.0, reduce=1))
     if parameters.ridges.offset is not None:
         return replace(parameters, ridges=replace(parameters.ridges, reduce=parameters.ridges.reduce or 1))
     photographs = [(sweep, file) for sweep in capture.sweeps for file in sweep.files]
@@ -224,7 +229,10 @@ def resolve(capture: Capture, parameters: Parameters) -> Parameters:
 
 
 def work_folder(capture: Capture, out: Path, parameters: Parameters) -> Path:
-    """The folder beside ``out`` for this capture and these parameters of the filter; emptied when they were others."""
+    """The folder beside ``out`` for this capture and these parameters of the filter; emptied when they were others. That of the capture
+    itself where it comes with features."""
+    if capture.features:
+        return capture.folder / capture.features
     digest, work = _made_from(capture, parameters), _work_path(out)
     stamp = work / STAMP
     if not stamp.is_file() or stamp.read_text() != digest:
@@ -237,6 +245,8 @@ def work_folder(capture: Capture, out: Path, parameters: Parameters) -> Path:
 
 def has_work_folder(capture: Capture, out: Path, parameters: Parameters) -> bool:
     """Whether a run of this capture with these parameters of the filter left its folder beside ``out``."""
+    if capture.features:
+        return True
     stamp = _work_path(out) / STAMP
     return stamp.is_file() and stamp.read_text() == _made_from(capture, parameters)
 
@@ -292,7 +302,7 @@ def calibrate(
     sweeps = find_features(stated, work, parameters, workers, progress)
     _check_memory(sweeps, 2 * memory_bytes // 3)  # some are turned and joined anew in each round
     errors, solution, biased = _solved(capture, sweeps, parameters, workers, progress)
-    told = [gains(np.load(_light_path(work, i))) for i in range(len(sweeps))]
+    told = [gains(np.load(light_path(work, i))) for i in range(len(sweeps))]
     calibration = _summed_up(capture, errors, solution, biased, told)
     save_calibration(out, calibration)
     return calibration
@@ -439,7 +449,7 @@ def volumes(
 
 def _blue_stacks(capture: Capture, work: Path) -> Iterator:
     for i, sweep in enumerate(capture.sweeps):
-        yield sweep.angle_deg, sweep.positions_mm, np.load(_blueness_path(work, i), mmap_mode="r")
+        yield sweep.angle_deg, sweep.positions_mm, np.load(blueness_path(work, i), mmap_mode="r")
 
 
 def _rays(sweeps: list[SweepFeatures], capture: Capture) -> Iterator:

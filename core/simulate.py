@@ -558,10 +558,10 @@ def samples(groom: Groom, radius_mm: float, half_height_mm: float, step_mm: floa
     return Samples(np.concatenate(points), np.concatenate(tangents), np.concatenate(strands))
 
 
-def visibility(hair: Hair, at: Samples, optics: Optics, angle_deg: float, rays: int = 32, slab_mm: float = 2.0) -> np.ndarray:
+def visibility(hair: Hair, at: Samples, optics: Optics, angle_deg: float, rays: int = 32, slab_mm: float = 2.0, finer: int = 2) -> np.ndarray:
     """Fraction (K,) of the aperture's rays that reach each sample, in focus, unoccluded by other fibers.
 
-    For each slab of depths the hair is drawn from points of the lens at twice the resolution of the photographs, which
+    For each slab of depths the hair is drawn from points of the lens at ``finer`` times the resolution of the photographs, which
     tells what stands before each sample. A fiber hides itself only where it comes back in front, as a curl does.
     """
     where = geometry.camera_points(at.points_mm, angle_deg, optics)
@@ -569,7 +569,7 @@ def visibility(hair: Hair, at: Samples, optics: Optics, angle_deg: float, rays: 
     if not len(where):
         return seen
     drawn = drawing(hair, angle_deg, optics=optics)
-    pitch = optics.pitch_mm / 2
+    pitch = optics.pitch_mm / finer
     slab = np.floor(where[:, 2] / slab_mm)
     for level in np.unique(slab):
         chosen = np.flatnonzero(slab == level)
@@ -641,7 +641,7 @@ def simulate(out: Path, params: SimulateParams, progress: Progress = silent, wor
     """
     out = Path(out)
     capture = plan(out, params)
-    if _begin(out, params):
+    if begin(out, params):
         return load_capture(out)
     progress("groom", 0, 1)
     lock = groom(lock_params(params), np.random.default_rng([params.seed, 0]))
@@ -664,10 +664,11 @@ def lock_params(params: SimulateParams) -> GroomParams:
     return GroomParams(params.style, params.fibers or scale.fibers, scale.lock_radius_mm, half_height + beyond)
 
 
-def _begin(out: Path, params: SimulateParams) -> bool:
-    """Make the folder ready; true if the capture is already there. Raises StrandscopeError where it holds something else."""
+def begin(out: Path, params: SimulateParams, more: dict | None = None) -> bool:
+    """Make the folder ready; true if the capture is already there. ``more``: what else was asked for. Raises StrandscopeError where the
+    folder holds something else."""
     journal = out / JOURNAL
-    asked = {"revision": REVISION, **asdict(params)}
+    asked = json.loads(json.dumps({"revision": REVISION, **asdict(params), **(more or {})}))
     try:
         if out.exists() and not out.is_dir():
             raise StrandscopeError(f"{out}: is a file; expected a new or empty folder for the capture")
@@ -682,7 +683,8 @@ def _begin(out: Path, params: SimulateParams) -> bool:
         raise explain(error, out) from error
     except ValueError as error:
         raise StrandscopeError(f"{journal}: not valid JSON ({error}); expected the parameters of a simulation") from error
-    for name, value in asked.items():
+    for name in [*asked, *(found if isinstance(found, dict) else ())]:
+        value = asked.get(name, "missing")
         if not isinstance(found, dict) or found.get(name, "missing") != value:
             was = found.get(name, "missing") if isinstance(found, dict) else found
             raise StrandscopeError(f"{out}: holds a simulation with {name} {was}, not {value}; expected the same parameters, or another folder")
@@ -721,12 +723,12 @@ def _photographs(capture: Capture, hair: Hair, params: SimulateParams, progress:
             planes = photograph(drawn, background, through, focus, disc)
             write_dng(capture.folder / file, expose(planes * np.float32(brighter), params.full_well_e, params.read_noise_e, rng), BLACK, WHITE)
 
-        for _ in _each(pool, take, missing):
+        for _ in each_of(pool, take, missing):
             done += 1
             progress("photographs", done, len(sequences))
 
 
-def _each(pool: ThreadPoolExecutor, work, items):
+def each_of(pool: ThreadPoolExecutor, work, items):
     """Results of ``work(item)`` as they come; what was not begun is dropped when one fails or the caller gives up."""
     futures = [pool.submit(work, item) for item in items]
     try:
@@ -759,8 +761,13 @@ def _write_truth(capture: Capture, lock: Groom, hair: Hair, params: SimulatePara
     def look(k):
         seen[:, k] = visibility(hair, at, capture.optics, capture.sweeps[k].angle_deg)
 
-    for done, _ in enumerate(_each(pool, look, range(len(capture.sweeps)))):
+    for done, _ in enumerate(each_of(pool, look, range(len(capture.sweeps)))):
         progress("truth", done + 1, len(capture.sweeps))
+    write_truth(capture, lock, at, seen)
+
+
+def write_truth(capture: Capture, lock: Groom, at: Samples, seen: np.ndarray) -> None:
+    """truth.npz of fibers, of samples of them, and of how much of the aperture of each sweep sees these (K, sweeps)."""
     arrays = {
         "points": lock.points_mm.astype(np.float32),
         "offsets": lock.offsets.astype(np.int64),
