@@ -7,7 +7,7 @@ observations likeliest. What compares curves with each other is in ``joining.py`
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numba import njit
@@ -206,6 +206,15 @@ class _Work:
     near: Box  # the length over which evidence is weighed
     claims: Box  # what a step uses up
     each: Callable  # each(function, items): a list, on all threads
+    memo: dict = field(default_factory=dict)  # what was told of curves that have not changed since
+
+
+def _remembered(work: _Work, key: tuple, curves: tuple[Curve, ...], tell: Callable):
+    """tell(), or what it was for these very curves before. How the hair bends at large may have changed a little since then."""
+    key = (*key, *map(id, curves))
+    if key not in work.memo:
+        work.memo[key] = curves, tell()  # the curves, so that no other gets their id
+    return work.memo[key][1]
 
 
 def trace(index: Index, grow_params: GrowParams, params: RefineParams, workers: int = 1, progress: Progress = silent) -> Grown:
@@ -215,6 +224,7 @@ def trace(index: Index, grow_params: GrowParams, params: RefineParams, workers: 
     The same for any number of ``workers``: each curve is fitted alone, and what compares curves runs in a fixed order.
     """
     curves: list[Curve] = []
+    memo: dict = {}
     seeds = find_seeds(index, grow_params)
     for number, evidence in enumerate(params.step_evidence):
         told = _part_of(progress, number, len(params.step_evidence))
@@ -223,7 +233,7 @@ def trace(index: Index, grow_params: GrowParams, params: RefineParams, workers: 
             evidence = max(evidence, min(params.bent_evidence[0] * bent, params.bent_evidence[1]))
         growing = replace(grow_params, min_evidence=evidence)
         with ThreadPoolExecutor(workers) as pool:
-            work = _work(index, params, growing, lambda function, items, pool=pool: list(pool.map(function, items)))
+            work = _work(index, params, growing, lambda function, items, pool=pool: list(pool.map(function, items)), memo)
             if evidence >= params.new_evidence:
                 _mark(curves, work)
                 curves = curves + _curves(grow(index, growing, workers, told, seeds))
@@ -244,7 +254,7 @@ def _part_of(progress: Progress, number: int, rounds: int) -> Progress:
     return lambda stage, done, total: progress(stage, number + GROWING_SHARE * done / max(total, 1), rounds)
 
 
-def _work(index: Index, params: RefineParams, grow_params: GrowParams, each: Callable) -> _Work:
+def _work(index: Index, params: RefineParams, grow_params: GrowParams, each: Callable, memo: dict | None = None) -> _Work:
     box, fit = box_of(grow_params, index), box_of(replace(grow_params, sigma_px=params.fit_sigma[0], sigma_focus_mm=params.fit_sigma[1]), index)
     wide = 1.5 * index.pitch
     slab, near = (mm / (2 * box.half[0]) for mm in (box.step, params.near_mm))  # of the length of the box
@@ -256,6 +266,7 @@ def _work(index: Index, params: RefineParams, grow_params: GrowParams, each: Cal
         near=box._replace(half=(0.5 * params.near_mm, box.half[1], wide), full_support=near * box.full_support),
         claims=claims_of(grow_params, box),
         each=each,
+        memo={} if memo is None else memo,
     )
 
 
@@ -310,7 +321,13 @@ def _join(curves: list[Curve], work: _Work) -> list[Curve]:
     """Join the ends that are of one fiber: the likeliest pairs first, each end once."""
     params, bend = work.params, _at_large(curves, work)
     found = meetings(curves, params.join_mm, params.join_place, params.join_turn_deg, params.join_misfit)
-    told = work.each(lambda meeting: _between(curves, meeting, work, bend), found)
+
+    def tell(meeting: Meeting) -> float:
+        one, two = meeting.ends
+        pair = curves[one // 2], curves[two // 2]
+        return _remembered(work, ("between", one % 2, two % 2), pair, lambda: _between(curves, meeting, work, bend))
+
+    told = work.each(tell, found)
     worth = [_join_worth(meeting, evidence, params) for meeting, evidence in zip(found, told, strict=True)]
     return chains(curves, paired(found, worth, params.join_least, params.join_margin), work.box.step)
 
@@ -338,7 +355,13 @@ def _uncross(curves: list[Curve], work: _Work) -> list[Curve]:
     point of the way that this makes must have more evidence than that of the way there is, by a factor of ``uncross``."""
     bend = _at_large(curves, work)
     found = passings(curves, UNCROSS_MM, UNCROSS_DEG, UNCROSS_INNER)
-    tried = work.each(lambda passing: _exchanged(curves, passing, work, bend), found)
+
+    def tell(passing: Passing) -> tuple[float, Curve, Curve]:
+        pair = curves[passing.end // 2], curves[passing.other]
+        key = "exchanged", passing.end % 2, passing.at, passing.onward
+        return _remembered(work, key, pair, lambda: _exchanged(curves, passing, work, bend))
+
+    tried = work.each(tell, found)
     taken: set[int] = set()
     out = list(curves)
     for number in sorted(range(len(found)), key=lambda i: (-tried[i][0], i)):

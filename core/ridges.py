@@ -29,7 +29,9 @@ from .raw import reduced
 
 BINS = 32  # orientations of a bank, over 180 degrees
 LEAST_PX = 100  # of a photograph's sides: it is not reduced any further
-LIGHT_PX = 8.0  # sigma of the Gaussian that tells the light around a pixel
+LIGHT_PX, LIGHT_BLOCK = 8.0, 4  # sigma of the Gaussian that tells the light around a pixel; it is told for blocks
+COARSE_PX, COARSE_EVERY = 1.5, 4  # sigma along the hair of the filters that say where one may be, and of how many bins one is asked
+COARSE_LOSS = 0.5  # their least answer to a ridge, in parts of that of the filters that seek it
 LIGHT_TO_OFFSET = 2.0  # c of the oriented operator, in parts of the light around clear hairs
 GRAIN_TO_OFFSET = 50.0  # and in standard deviations of the grain
 BROAD = 0.5  # breadth of hair that is twice as wide as the filters: it is still found; twice that is not
@@ -164,9 +166,14 @@ def _measure_alone(plane, params):
         return _relative_peaks(blurred, _folded(bank), bank.shape[1] // 2, np.float32(params.offset), np.float32(params.low))
     even, odd = line_banks(params.across_px, params.seek_px)
     narrow, wide = (line_banks(across_px, params.along_px)[0] for across_px in (params.across_px, params.turn_px))
-    light = ndimage.gaussian_filter(plane, LIGHT_PX)
-    light_and_least = light, np.float32(params.offset), np.float32(params.low)
-    return _line_peaks(plane, _folded(even), odd, _folded(narrow), _folded(wide), narrow.shape[1] // 2, *light_and_least)
+    coarse, _ = line_banks(params.across_px, COARSE_PX)
+    banks = _folded(coarse[::COARSE_EVERY]), np.ascontiguousarray(_folded(even).T), odd, _folded(narrow), _folded(wide)
+    return _line_peaks(plane, *banks, narrow.shape[1] // 2, _light_around(plane), np.float32(params.offset), np.float32(params.low))
+
+
+def _light_around(plane):
+    """Light around blocks of LIGHT_BLOCK pixels of a plane (H, W): (h, w) float32."""
+    return ndimage.gaussian_filter(reduced(plane, LIGHT_BLOCK), LIGHT_PX / LIGHT_BLOCK)
 
 
 # ---- banks -----------------------------------------------------------------------------------------------------------
@@ -209,9 +216,9 @@ def line_banks(across_px: float, along_px: float) -> tuple[np.ndarray, np.ndarra
 # ---- kernels ---------------------------------------------------------------------------------------------------------
 #
 # A bank of even filters is one matrix product a row: the pixels at +(j, i) and -(j, i) are added first, which halves the
-# work, and the (B, (k k + 1) / 2) filters times the (…, W) sums run at the speed of sgemm: 2 B (k k + 1) / 2 flops a pixel,
-# 3904 for 32 filters 11x11. That is the bound of this stage; reading the photograph is a hundredth of it. The long filters
-# work on crests alone, some tenth of the pixels: a folded patch once, then some five products with it.
+# work, and the (B, (k k + 1) / 2) filters times the (…, W) sums run at the speed of sgemm. Eight filters 7x7 for every pixel are
+# 400 flops; that and the sums, 25 numbers a pixel written and read in the cache, are the bound of this stage. All 32 filters 11x11
+# would be 3904; they are asked where the eight say that there may be a hair, and the long ones on crests.
 
 
 def _folded(bank: np.ndarray) -> np.ndarray:
@@ -329,9 +336,9 @@ def _dot(a, b):
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _finer(patch, bank, best):
-    """(bin, fraction of a bin) of the strongest of folded filters (B, n) on a folded patch (n,), climbing from bin ``best``,
-    by a parabola."""
+def _climbed(patch, bank, best):
+    """(bin, answers of the bin before, of it, and of the next) of the strongest of folded filters (B, n) on a folded patch (n,),
+    climbing from bin ``best`` for four bins at most."""
     bins = len(bank)
     left, middle, right = _dot(patch, bank[(best - 1) % bins]), _dot(patch, bank[best]), _dot(patch, bank[(best + 1) % bins])
     for _ in range(4):
@@ -341,49 +348,90 @@ def _finer(patch, bank, best):
         elif right > middle:
             best = (best + 1) % bins
             left, middle, right = middle, right, _dot(patch, bank[(best + 1) % bins])
-    if middle <= left or middle <= right:  # still climbing
-        return best, np.float32(0)
-    return best, np.float32(0.5) * (left - right) / (left - 2 * middle + right)
+        else:
+            break
+    return best, left, middle, right
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _line_peaks(plane, filters, odd, narrow, wide, rim, light, offset, low):
+def _light_row(light, y, row):
+    """Fill row (W,) with the light at row y of a photograph between the middles of its blocks, light (h, w)."""
+    at = min(max((y + np.float32(0.5)) / LIGHT_BLOCK - np.float32(0.5), np.float32(0)), np.float32(light.shape[0] - 1))
+    j = min(int(at), max(light.shape[0] - 2, 0))
+    upper, lower, part = light[j], light[min(j + 1, light.shape[0] - 1)], np.float32(at - j)
+    for x in range(len(row)):
+        across = min(max((x + np.float32(0.5)) / LIGHT_BLOCK - np.float32(0.5), np.float32(0)), np.float32(light.shape[1] - 1))
+        i = min(int(across), max(light.shape[1] - 2, 0))
+        k, f = min(i + 1, light.shape[1] - 1), np.float32(across - i)
+        one, two = upper[i] + part * (lower[i] - upper[i]), upper[k] + part * (lower[k] - upper[k])
+        row[x] = one + f * (two - one)
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _line_peaks(plane, coarse, filters, odd, narrow, wide, rim, light, offset, low):
     """Crests of the line filters' response over (offset + light), their angle, shift and breadth; four (H, W) arrays.
 
-    A short filter seeks them everywhere; where there is one, long filters tell its strength (``narrow``) and angle (``wide``).
-    All banks but ``odd`` are folded; rim is half the width of the long ones.
+    A few filters that are short, and so answer to many angles, say where there may be one; there a bank of longer ones (``filters``)
+    seeks it, and where it is, long filters tell its strength (``narrow``) and angle (``wide``). All banks but ``odd`` are folded, and
+    ``filters`` turned, (n, BINS); rim is half the width of the long ones. light (h, w): that around blocks of LIGHT_BLOCK pixels.
     """
     height, width = plane.shape
-    half = odd.shape[1] // 2
+    half, short = odd.shape[1] // 2, int(np.sqrt(2 * coarse.shape[1])) // 2
     strength = np.zeros((height, width), np.float32)
     angle, shift, breadth = np.zeros_like(strength), np.zeros_like(strength), np.zeros_like(strength)
-    sums = np.empty((filters.shape[1], width - 2 * half), np.float32)
-    values = np.empty((filters.shape[0], width - 2 * half), np.float32)
+    sums = np.empty((coarse.shape[1], width - 2 * short), np.float32)
+    values = np.empty((coarse.shape[0], width - 2 * short), np.float32)
+    top, least_of, lit = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
+    cols, near, answers = np.empty(width, np.int32), np.empty((width, len(filters)), np.float32), np.empty((width, BINS), np.float32)
     patch = np.empty(narrow.shape[1], np.float32)
     for y in range(rim, height - rim):
-        _fold_row(plane, y, half, sums)
-        np.dot(filters, sums, values)
+        _fold_row(plane, y, short, sums)
+        np.dot(coarse, sums, values)
+        _light_row(light, y, lit)
+        top[:] = 0
+        for b in range(len(coarse)):
+            line, into = values[b], top[short : width - short]
+            for x in range(len(line)):
+                into[x] = max(into[x], line[x])
+        for x in range(width):
+            least_of[x] = low * (offset + lit[x])
+        asked = 0
         for x in range(rim, width - rim):
-            best, _, value = _strongest(values, x - half)
-            least = low * (offset + light[y, x])
+            if top[x] >= COARSE_LOSS * least_of[x]:
+                cols[asked] = x
+                _fold_patch(plane, y, x, half, near[asked])
+                asked += 1
+        if asked == 0:
+            continue
+        np.dot(near[:asked], filters, answers[:asked])
+        for i in range(asked):
+            x, best = cols[i], 0
+            answer, least = answers[i], least_of[x]
+            for b in range(1, BINS):
+                if answer[b] > answer[best]:
+                    best = b
+            value = answer[best]
             if value < least:
                 continue
             step = _answer(plane, y, x, odd[best]) / value
-            phi = best * np.pi / filters.shape[0]
+            phi = best * np.pi / BINS
             if abs(step) * max(abs(np.sin(phi)), abs(np.cos(phi))) > 0.6:  # the crest belongs to another pixel
                 continue
             _fold_patch(plane, y, x, rim, patch)
             if _dot(patch, narrow[best]) < TURNED_LOSS * least:
                 continue
-            turned, fraction = _finer(patch, wide, best)
+            turned, left, middle, right = _climbed(patch, wide, best)
+            fraction = np.float32(0)
+            if middle > left and middle > right:  # else it is still climbing
+                fraction = np.float32(0.5) * (left - right) / (left - 2 * middle + right)
             value = _dot(patch, narrow[turned])
             if value < least:
                 continue
-            angle[y, x], _ = _turned(turned, fraction, filters.shape[0])
+            angle[y, x], _ = _turned(turned, fraction, BINS)
             # the way to the crest along the normal of the bin, told along that of the angle
-            strength[y, x] = value / (offset + light[y, x])
+            strength[y, x] = value / (offset + lit[x])
             shift[y, x] = step * np.cos(phi - angle[y, x])
-            breadth[y, x] = np.log(max(_dot(patch, wide[turned]), np.float32(0.1) * value) / value)
+            breadth[y, x] = np.log(max(middle, np.float32(0.1) * value) / value)
     return strength, angle, shift, breadth
 
 

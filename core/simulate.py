@@ -574,7 +574,9 @@ def visibility(hair: Hair, at: Samples, optics: Optics, angle_deg: float, rays: 
     for level in np.unique(slab):
         chosen = np.flatnonzero(slab == level)
         points = where[chosen]
-        low, high = points[:, :2].min(axis=0) - 0.5, points[:, :2].max(axis=0) + 0.5
+        # by how much the lens and the perspective move what lies at the rim of the slab
+        shift = 0.5 * slab_mm * (aperture_radius_mm(optics) + np.abs(points[:, :2]).max()) / (optics.working_distance_mm - slab_mm)
+        low, high = points[:, :2].min(axis=0) - 0.4 - shift, points[:, :2].max(axis=0) + 0.4 + shift
         rows, columns = np.ceil((high - low)[::-1] / pitch).astype(int) + 1
         view = (np.float32((level + 0.5) * slab_mm), np.float32(optics.working_distance_mm), np.float32(pitch))
         axis = (np.float32(-low[0] / pitch), np.float32(high[1] / pitch))

@@ -18,7 +18,7 @@ from . import geometry
 from .capture import Capture, load_capture, save_capture
 from .features import RECORDS, pack, save_features
 from .files import atomic
-from .groom import groom
+from .groom import Groom, groom
 from .hull import HullParams
 from .pipeline import blueness_path, features_path, light_path
 from .progress import Progress, silent
@@ -64,9 +64,7 @@ def simulate_features(
     capture = replace(plan(out, params), features=FOLDER, turntable=None)
     if begin(out, params, asked):
         return load_capture(out)
-    progress("groom", 0, 1)
-    lock = groom(replace(lock_params(params), overlap_mm=0.03), np.random.default_rng([params.seed, 0]))
-    progress("groom", 1, 1)
+    lock = _kept_groom(out / "groom.npz", params, progress)
     hair = prepare(lock, np.random.default_rng([params.seed, 1]))
     scale, rig = SCALES[params.scale], params.misalignment.errors(capture).corrected(capture)
     at = samples(lock, np.inf, scale.rows / 2 * params.pitch_mm + 1.0)
@@ -90,7 +88,20 @@ def simulate_features(
     inside &= np.abs(at.points_mm[:, 1]) <= (scale.rows - 1) / 2 * params.pitch_mm - 0.1
     write_truth(capture, lock, Samples(at.points_mm[inside], at.tangents[inside], at.strand[inside]), seen[inside])
     save_capture(replace(capture, unknown={"simulation": asdict(params) | asked}))
+    (out / "groom.npz").unlink()
     return load_capture(out)
+
+
+def _kept_groom(path: Path, params: SimulateParams, progress: Progress) -> Groom:
+    """The lock, which takes minutes in large, from a run before or made now."""
+    progress("groom", 0, 1)
+    if not path.is_file():
+        made = groom(replace(lock_params(params), overlap_mm=0.03), np.random.default_rng([params.seed, 0]))
+        with atomic(path) as part:
+            np.savez(part, **asdict(made))
+    progress("groom", 1, 1)
+    with np.load(path) as file:
+        return Groom(**file)
 
 
 def _ridges(at: Samples, seen, sweep, optics, shape, observe: ObserveParams, rng) -> list[Ridges]:
