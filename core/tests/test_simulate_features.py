@@ -43,9 +43,10 @@ def test_what_is_hidden_leaves_fewer_features(capture):
     # a piece is found about as long as its strength is over the least: none where nothing of the aperture sees it
     assert observe.strength * np.quantile(seen, 0.05) < observe.least
     counts = [len(load_features(features_path(capture.folder / FOLDER, k))) for k in range(len(capture.sweeps))]
-    # mm of hair that half the aperture sees, times 35 rows a mm, in some 7 photographs each
-    wanted = (seen > 0.5).sum(axis=0) * 0.1 * 35 * 7
-    assert 0.6 < np.sum(counts) / wanted.sum() < 1.6
+    # mm of hair that half the aperture sees, times 35 rows a mm, in the photographs in which a strong one is found, and what is spurious
+    photographs = 2 * observe.focus_mm * np.sqrt(2 * np.log(observe.strength / observe.least)) / PARAMS.step_mm
+    wanted = (seen > 0.5).sum(axis=0) * 0.1 * 35 * photographs * (1 + observe.spurious)
+    assert np.sum(counts) == pytest.approx(wanted.sum(), rel=0.3)
 
 
 def test_as_many_as_the_filter_finds_in_photographs(capture, tmp_path):
