@@ -21,6 +21,11 @@ FORMAT, VERSION = "strandscope-capture", 1
 FILE_NAME = "capture.json"
 
 
+def features_path(folder: Path, i: int) -> Path:
+    """Where a folder, of a run or of a capture without photographs, has the features of sweep i."""
+    return folder / f"sweep_{i:03d}.features"
+
+
 @dataclass(frozen=True)
 class Sweep:
     """The photographs of one turntable angle, in the order of the camera's positions."""
@@ -75,7 +80,7 @@ class Capture:
     def shape(self) -> tuple[int, int]:
         """Rows and columns of a channel plane, read off the first photograph, or the first features."""
         if self.features:
-            with open(self.folder / self.features / "sweep_000.features", "rb") as file:
+            with open(features_path(self.folder / self.features, 0), "rb") as file:
                 return tuple(int(n) for n in np.load(file)[1:])
         return self.planes(self.sweeps[0].files[0]).shape[1:]
 
@@ -226,7 +231,7 @@ class _Reader:
     def _all_there(self, capture: Capture) -> None:
         for i, sweep in enumerate(capture.sweeps):
             if capture.features:
-                path = capture.folder / capture.features / f"sweep_{i:03d}.features"
+                path = features_path(capture.folder / capture.features, i)
                 if not path.is_file():
                     raise CaptureError(f"{self.path}: {len(capture.sweeps)} sweeps have features in place of photographs; missing {path.name}")
                 continue

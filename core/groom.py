@@ -241,6 +241,7 @@ def _push_apart(controls: np.ndarray, radii: np.ndarray, params: GroomParams) ->
     places = np.linspace(0, count - 3, (count - 3) * _pieces(controls, params) + 1)
     first, weights = _weights(places, count)
     offsets = np.arange(fibers + 1) * len(places)
+    enough = params.clearance_mm + params.overlap_mm if params.overlap_mm > 0 else 0.5 * params.clearance_mm
     start, built, skin = controls, None, 0.06
     for turn in range(params.rounds):
         points = _evaluate(controls, first, weights).reshape(-1, 3)
@@ -248,7 +249,7 @@ def _push_apart(controls: np.ndarray, radii: np.ndarray, params: GroomParams) ->
             near = _near_segments(points, offsets, 2 * radii.max() + params.clearance_mm + skin)
             built = points
         moves, worst = _moves(points, *near, len(places), radii, params.clearance_mm, first, weights, fibers, count)
-        if worst <= max(0.5 * params.clearance_mm, params.clearance_mm + params.overlap_mm if params.overlap_mm else 0.0):
+        if worst <= enough:
             return controls
         controls = controls + moves
         if turn < 100:

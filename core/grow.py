@@ -26,7 +26,7 @@ from numba import njit
 
 from .features import ANGLE_STEPS, BLOCK_PX, STRIP_PX, USED, Index, cell_range, frames_between, image_of, run_of
 from .geometry import slope, to_image, turn, turn_back
-from .look import GATE, PLACE_PX, Box, claimed, fit, hair_frame, look, new_view, unit
+from .look import GATE, LEAST_SIZE, PLACE_PX, Box, claimed, fit, hair_frame, look, new_view, unit
 from .progress import Progress, silent
 from .stops import Stop
 
@@ -325,7 +325,7 @@ def _promise(index, centre, cell, direction, gate):
     half = 0.75 * cell
     for k in range(len(index.cos)):
         frame = hair_frame(index, k, centre, direction)
-        if frame.size < 0.2:
+        if frame.size < LEAST_SIZE:
             continue
         u0, v0, w0 = frame.p
         first_frame, last_frame = frames_between(index, k, w0 - cell, w0 + cell)

@@ -21,6 +21,7 @@ TWIST_RAD = 0.0698  # a camera that sees the hair turned by more than this (4 de
 SHARE_POWER = 0.1  # of the share of its observations that a camera has: many that see a little tell more than one that sees all
 UNSEEN = 0.1  # evidence that a camera costs which sees no hair where it should be
 SPREAD_PX = (0.18, 0.3)  # of a hair's observations across it; a camera whose observations spread by the second more tells nothing
+LEAST_SIZE = 0.2  # of the image of a mm of hair, mm
 GATE = 2.2  # of sigma_angle: observations turned by more belong to other hair
 BOW = 0.207  # biweights (1 - BOW x^2)^2 are about as wide as Gaussians: no exp, and nothing from far away
 
@@ -88,6 +89,12 @@ def hair_frame(index, k, p, g):
     # how the image of the point moves as it slides along the hair, at focus: d(u, v) = (g_u + u/l g_w, g_v + v/l g_w)
     du, dv = gu + pu / index.distance * gw, gv + pv / index.distance * gw
     return Frame((pu, pv, pw), (gu, gv, gw), (su, sv, sw), t, np.arctan2(dv, du), np.hypot(du, dv))
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def shows(index, k, frame):
+    """Whether camera k shows a hair of this Frame: it comes into focus inside a photograph, and does not point at the camera."""
+    return frame.size >= LEAST_SIZE and sees(index, k, frame.p[0], frame.p[1], frame.p[2])
 
 
 class Hits(NamedTuple):
@@ -236,7 +243,7 @@ def look(index, p, g, bend, box, view):
         if not sees(index, k, frame.p[0], frame.p[1], frame.p[2]):
             continue
         could += 1
-        if frame.size < 0.2:  # the hair points at the camera
+        if frame.size < LEAST_SIZE:  # the hair points at the camera
             continue
         tx, ty, tz = _turn_back(frame.t[0], frame.t[1], frame.t[2], index.cos[k], index.sin[k])
         sx, sy, sz = _turn_back(frame.s[0], frame.s[1], frame.s[2], index.cos[k], index.sin[k])
@@ -443,7 +450,7 @@ def claimed(index, points, box):
         g = chord(points, j)
         for k in range(len(index.cos)):
             frame = hair_frame(index, k, points[j], g)
-            if frame.size < 0.2 or not sees(index, k, frame.p[0], frame.p[1], frame.p[2]):
+            if not shows(index, k, frame):
                 continue
             found = gather(index, k, frame, 0.0, 0.0, box, hits, 0)
             if count + found > len(numbers):

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .capture import Capture, load_capture
+from .capture import Capture, features_path, load_capture
 from .confidence import confidence, expected_error
 from .errors import CaptureError, StrandscopeError
 from .features import RECORDS, SweepFeatures, build_index, load_features, pack, save_features, seen_by, unpack, upright
@@ -197,11 +197,6 @@ def _check_memory(sweeps: list[SweepFeatures], memory_bytes: int) -> None:
     if needed > memory_bytes:
         told, allowed = (f"{n / 1e9:.1f} GB" for n in (needed, memory_bytes))
         raise StrandscopeError(f"{sum(map(len, sweeps))} features need about {told} of memory; {allowed} are allowed (--memory), give more")
-
-
-def features_path(work: Path, i: int) -> Path:
-    """Where a work folder has the features of sweep i."""
-    return work / f"sweep_{i:03d}.features"
 
 
 def blueness_path(work: Path, i: int) -> Path:

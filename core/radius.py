@@ -15,7 +15,7 @@ from numba import njit
 
 from .features import BREADTHS, Index, SweepFeatures, breadth_of, strength_of
 from .grow import GrowParams
-from .look import BOW, Box, chord, gather, hair_frame, new_hits, sees
+from .look import BOW, Box, chord, gather, hair_frame, new_hits, shows
 from .refine import RefineParams, _work
 
 
@@ -37,7 +37,7 @@ def _tally(index, k, breadth, points, box, tally):
     hits = new_hits(1)
     for j in range(len(points)):
         frame = hair_frame(index, k, points[j], chord(points, j))
-        if frame.size < 0.2 or not sees(index, k, frame.p[0], frame.p[1], frame.p[2]):
+        if not shows(index, k, frame):
             continue
         for i in range(gather(index, k, frame, 0.0, 0.0, box, hits, 0)):
             x = hits.across[i] / box.sigma

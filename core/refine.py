@@ -17,7 +17,7 @@ from .features import USED, Index
 from .geometry import turn_back
 from .grow import Grown, GrowParams, box_of, claims_of, find_seeds, grow, grow_end
 from .joining import Curve, Meeting, Passing, bridged, chains, end_of, leading_to, meetings, once, paired, part, passings, turned
-from .look import BOW, Box, chord, claimed, fit, gather, hair_frame, look, new_hits, new_view, sees
+from .look import BOW, Box, chord, claimed, fit, gather, hair_frame, look, new_hits, new_view, shows
 from .progress import Progress, silent
 from .spline import Stiffness, across, covariance, smoothed, stiffness
 from .stops import Stop
@@ -87,7 +87,7 @@ def _tie(index, points, box, normal, right):
                 normal[j, c, d] = STIFF * g[c] * g[d]
         for k in range(len(index.cos)):
             frame = hair_frame(index, k, points[j], g)
-            if frame.size < 0.2 or not sees(index, k, frame.p[0], frame.p[1], frame.p[2]):
+            if not shows(index, k, frame):
                 continue
             count = gather(index, k, frame, 0.0, 0.0, box, hits, 0)
             s = r = 0.0

@@ -755,9 +755,7 @@ def _gain(hair: Hair, fog: Density, look: Look, params: SimulateParams) -> float
 
 def _write_truth(capture: Capture, lock: Groom, hair: Hair, params: SimulateParams, progress: Progress, pool: ThreadPoolExecutor) -> None:
     """truth.npz: the fibers, samples of them inside the captured volume, and how much of the aperture sees each."""
-    scale, pitch, margin = SCALES[params.scale], params.pitch_mm, 0.1
-    radius = min((scale.columns - 1) / 2 * pitch, scale.half_range_mm) - margin
-    at = samples(lock, radius, (scale.rows - 1) / 2 * pitch - margin)
+    at = samples(lock, *seen_volume(params))
     seen = np.zeros((len(at.points_mm), len(capture.sweeps)), np.float16)
 
     def look(k):
@@ -766,6 +764,12 @@ def _write_truth(capture: Capture, lock: Groom, hair: Hair, params: SimulatePara
     for done, _ in enumerate(each_of(pool, look, range(len(capture.sweeps)))):
         progress("truth", done + 1, len(capture.sweeps))
     write_truth(capture, lock, at, seen)
+
+
+def seen_volume(params: SimulateParams) -> tuple[float, float]:
+    """Radius and half height (mm) of the cylinder that every sweep sees, less a margin."""
+    scale, pitch, margin = SCALES[params.scale], params.pitch_mm, 0.1
+    return min((scale.columns - 1) / 2 * pitch, scale.half_range_mm) - margin, (scale.rows - 1) / 2 * pitch - margin
 
 
 def write_truth(capture: Capture, lock: Groom, at: Samples, seen: np.ndarray) -> None:

@@ -15,15 +15,15 @@ import numpy as np
 from numba import njit
 
 from . import geometry
-from .capture import Capture, load_capture, save_capture
+from .capture import Capture, features_path, load_capture, save_capture
 from .features import RECORDS, pack, save_features
 from .files import atomic
 from .groom import Groom, groom
 from .hull import HullParams
-from .pipeline import blueness_path, features_path, light_path
+from .pipeline import blueness_path, light_path
 from .progress import Progress, silent
 from .ridges import Ridges
-from .simulate import SCALES, Samples, SimulateParams, begin, each_of, lock_params, plan, prepare, samples, visibility, write_truth
+from .simulate import SCALES, Samples, SimulateParams, begin, each_of, lock_params, plan, prepare, samples, seen_volume, visibility, write_truth
 
 FOLDER = "features"  # in the capture
 PAPER_FIBERS = 6500  # of a whole switch, as the paper fills it
@@ -84,8 +84,8 @@ def simulate_features(
     with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
         for done, _ in enumerate(each_of(pool, look, range(len(capture.sweeps)))):
             progress("features", done + 1, len(capture.sweeps))
-    inside = np.hypot(at.points_mm[:, 0], at.points_mm[:, 2]) <= min((scale.columns - 1) / 2 * params.pitch_mm, scale.half_range_mm) - 0.1
-    inside &= np.abs(at.points_mm[:, 1]) <= (scale.rows - 1) / 2 * params.pitch_mm - 0.1
+    radius, half_height = seen_volume(params)
+    inside = (np.hypot(at.points_mm[:, 0], at.points_mm[:, 2]) <= radius) & (np.abs(at.points_mm[:, 1]) <= half_height)
     write_truth(capture, lock, Samples(at.points_mm[inside], at.tangents[inside], at.strand[inside]), seen[inside])
     save_capture(replace(capture, unknown={"simulation": asdict(params) | asked}))
     (out / "groom.npz").unlink()

@@ -5,13 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from strandscope.core.capture import load_capture
+from strandscope.core.capture import features_path, load_capture
 from strandscope.core.compare import load_truth, score
 from strandscope.core.errors import StrandscopeError
 from strandscope.core.features import load_features, unpack
 from strandscope.core.geometry import camera_points
 from strandscope.core.hull import HullParams
-from strandscope.core.pipeline import features_path, find_features, preset, reconstruct, resolve
+from strandscope.core.pipeline import find_features, preset, reconstruct, resolve
 from strandscope.core.progress import silent
 from strandscope.core.simulate import SimulateParams, simulate
 from strandscope.core.simulate_features import FOLDER, ObserveParams, simulate_features
