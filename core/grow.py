@@ -24,16 +24,22 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from .features import ANGLE_STEPS, BLOCK_PX, STRIP_PX, USED, Index, cell_range, frames_between, image_of, run_of
+from .features import ANGLE_STEPS, BLOCK_PX, COL_STEPS, ROW_STEPS, STRIP_PX, USED, Index, cell_range, frames_between, image_of, run_of
 from .geometry import slope, to_image, turn, turn_back
 from .look import GATE, LEAST_SIZE, PLACE_PX, Box, claimed, fit, hair_frame, look, new_view, unit
 from .progress import Progress, silent
 from .stops import Stop
 
-_turn, _turn_back, _slope = njit(turn), njit(turn_back), njit(slope)
+_turn, _turn_back, _slope, _to_image = njit(turn), njit(turn_back), njit(slope), njit(to_image)
 _DOUBLE_COS, _DOUBLE_SIN = (f(np.arange(ANGLE_STEPS) * (2 * np.pi / ANGLE_STEPS)) for f in (np.cos, np.sin))  # of twice a stored angle
+IN_CELL = 256  # observations of a camera in a cell that are looked at
 SEEN_AT_ALL = 3  # observations of a camera in a seed's cell
+H_MM = 0.1  # h of Table 1, for which omega and gamma are told
+RECORDED, SEEN_BY = 3, 4  # features by which a sweep records a cell, and sweeps that must
 PROMISED = (0.66, 0.71)  # evidence of a seed for each camera that sees something like it, and for each of their shares; 3 in 100 have more
+PHASES = 8  # groups of layers of cells in which seeds are tried
+FAR_FIRST = (0, 4, 2, 6, 1, 5, 3, 7)  # the order of the groups
+RASTERED = 4  # parts in which layers are counted
 BATCH = 64  # seeds grown against the same observations; part of the result, not of the machine
 DEEP, FOCUS = 2.3, 0.5  # of sigma_focus: how far along a ribbon a camera's depth is looked for, and how well it must agree
 OBSERVED_TOGETHER = 17.0  # observations of one camera in a step that err alike: rows and frames that see the same
@@ -43,9 +49,9 @@ OBSERVED_TOGETHER = 17.0  # observations of one camera in a step that err alike:
 class GrowParams:
     """Section 4.2 and Table 1; pixels are those of the channel plane."""
 
-    step_mm: float = 0.1  # h
-    cone_deg: float = 1.5  # omega: largest turn in one step, beyond the one that the curvature foretells
-    max_correction_px: float = 0.5  # gamma: largest correction in one step
+    step_mm: float = 0.2  # twice the h of Table 1: as good, in half the time
+    cone_deg: float = 1.5  # omega: largest turn in H_MM, beyond the one that the curvature foretells
+    max_correction_px: float = 0.5  # gamma: largest correction in H_MM
     box_px: tuple[float, float, float] = (40.0, 30.0, 8.0)  # a_g, a_s, a_t: full extents along the hair, the slope, across
     min_cameras: int = 3  # m: cameras that a step needs
     bridge_mm: float = 0.5  # how far a hair is continued where it is not observed
@@ -81,7 +87,7 @@ class Grown:
 
 def box_of(params: GrowParams, index: Index) -> Box:
     """What growing looks at."""
-    pitch_mm, cone = index.pitch, np.radians(params.cone_deg)
+    pitch_mm, cone = index.pitch, np.radians(params.cone_deg * params.step_mm / H_MM)
     frame_mm = np.median(np.abs(np.diff(index.positions)))
     # rows times frames of a hair upright in the image; 0.8 is the mean of the other two weights on a true hair
     full_support = 0.8 * params.box_px[0] * np.sqrt(2 * np.pi) * params.sigma_focus_mm / frame_mm
@@ -89,7 +95,7 @@ def box_of(params: GrowParams, index: Index) -> Box:
         step=params.step_mm,
         cone_cos=float(np.cos(cone)),
         cone_sin=float(np.sin(cone)),
-        gamma=params.max_correction_px * pitch_mm,
+        gamma=params.max_correction_px * pitch_mm * params.step_mm / H_MM,
         half=tuple(0.5 * px * pitch_mm for px in params.box_px),
         min_cameras=params.min_cameras,
         bridge=round(params.bridge_mm / params.step_mm),
@@ -250,97 +256,124 @@ class _Grid(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _raster(index, grid, masks):
-    """Set bit k of every cell of masks (nx, ny, nz) in which sweep k has a feature."""
+def _crossed(index, grid, number, block):
+    """Whether a block of rows has a part in one of the layers of ``number``."""
+    _, low = _to_image(0.0, float((block + 1) * BLOCK_PX), index.pitch, index.axis_col, index.axis_row)
+    _, high = _to_image(0.0, float(block * BLOCK_PX), index.pitch, index.axis_col, index.axis_row)
+    first, last = int((low - grid.low[1]) / grid.cell), int((high - grid.low[1]) / grid.cell)
+    return np.any(number[max(first, 0) : last + 1] >= 0)
+
+
+@njit(cache=True, nogil=True)
+def _raster(index, grid, number, least, sweeps):
+    """How many sweeps have ``least`` features or more that no curve stands on, in each cell of some layers of the grid: sweeps
+    (layers, nx, nz) uint8, begun with zeros. number (ny,): which of these layers each one of the grid is, or -1."""
+    count = np.empty(sweeps.shape, np.uint8)
+    strips, blocks = index.columns // STRIP_PX + 1, index.rows // BLOCK_PX + 1
     for k in range(len(index.cos)):
+        count[:] = 0
         frames = index.first_position[k + 1] - index.first_position[k]
-        strips, blocks = index.columns // STRIP_PX + 1, index.rows // BLOCK_PX + 1
         for strip in range(strips):
             for block in range(blocks):
                 start, stop = run_of(index, k, strip, block, 0, frames)
+                if not _crossed(index, grid, number, block):
+                    continue
                 for i in range(start, stop):
                     u, v = image_of(index, i, strip, block)
+                    b = number[min(max(int((v - grid.low[1]) / grid.cell), 0), len(number) - 1)]
+                    if b < 0 or index.strength[i] >= USED:
+                        continue
                     d = index.positions[index.first_position[k] + index.frame[i]]
-                    x, y, z = _turn_back(u, v, d, index.cos[k], index.sin[k])
-                    a, b, c = int((x - grid.low[0]) / grid.cell), int((y - grid.low[1]) / grid.cell), int((z - grid.low[2]) / grid.cell)
-                    if 0 <= a < masks.shape[0] and 0 <= b < masks.shape[1] and 0 <= c < masks.shape[2]:
-                        masks[a, b, c] |= np.uint64(1) << np.uint64(k % 64)
+                    x, _, z = _turn_back(u, v, d, index.cos[k], index.sin[k])
+                    a, c = int((x - grid.low[0]) / grid.cell), int((z - grid.low[2]) / grid.cell)
+                    if 0 <= a < count.shape[1] and 0 <= c < count.shape[2] and count[b, a, c] < least:
+                        count[b, a, c] += 1
+                        if count[b, a, c] == least:
+                            sweeps[b, a, c] += 1
+
+
+class _Cell(NamedTuple):
+    """What S sweeps have in a cell of the grid: room for it."""
+
+    angles: np.ndarray  # (S, IN_CELL) uint8
+    free: np.ndarray  # (S, IN_CELL) uint8: whether no curve stands on it
+    count: np.ndarray  # (S,) int64
+    normals: np.ndarray  # (S, 3)
+    weights: np.ndarray  # (S,)
 
 
 @njit(cache=True, nogil=True)
-def _bits(masks):
-    counts = np.empty(masks.shape, np.uint8)
-    flat, out = masks.reshape(-1), counts.reshape(-1)
-    for i in range(len(flat)):
-        n, m = 0, flat[i]
-        while m:
-            m &= m - np.uint64(1)
-            n += 1
-        out[i] = n
-    return counts
+def _new_cell(cameras):
+    return _Cell(
+        np.empty((cameras, IN_CELL), np.uint8),
+        np.empty((cameras, IN_CELL), np.uint8),
+        np.zeros(cameras, np.int64),
+        np.zeros((cameras, 3)),
+        np.zeros(cameras),
+    )
 
 
-@njit(cache=True, nogil=True)
-def _seed_direction(index, centre, cell, least):
+@njit(cache=True, nogil=True, fastmath=True)
+def _seed_direction(index, centre, size, least, cell):
     """The direction (3,) that the mean orientations of the sweeps with unused features in a cell agree on, and how many these are;
-    no direction where they are fewer than ``least``."""
-    normals, weights = np.zeros((len(index.cos), 3)), np.zeros(len(index.cos))
-    half, cameras = 0.75 * cell, 0
+    no direction where they are fewer than ``least``. What is in the cell is left in ``cell``."""
+    half, cameras = 0.75 * size, 0
+    unit_col, unit_row = index.pitch / COL_STEPS, index.pitch / ROW_STEPS
     for k in range(len(index.cos)):
+        cell.count[k], cell.weights[k] = 0, 0.0
         u0, v0, w0 = _turn(centre[0], centre[1], centre[2], index.cos[k], index.sin[k])
-        first_frame, last_frame = frames_between(index, k, w0 - cell, w0 + cell)
+        first_frame, last_frame = frames_between(index, k, w0 - size, w0 + size)
         s0, s1, b0, b1 = cell_range(index, u0, v0, half, half)
         re = im = 0.0
+        count = 0
         for strip in range(s0, s1):
             for block in range(b0, b1):
                 start, stop = run_of(index, k, strip, block, first_frame, last_frame)
+                x, y = _to_image(float(strip * STRIP_PX), float(block * BLOCK_PX), index.pitch, index.axis_col, index.axis_row)
+                low_col, high_col = (u0 - half - x) / unit_col, (u0 + half - x) / unit_col
+                low_row, high_row = (y - v0 - half) / unit_row, (y - v0 + half) / unit_row
                 for i in range(start, stop):
-                    if index.strength[i] >= USED:
-                        continue
-                    u, v = image_of(index, i, strip, block)
-                    if abs(u - u0) > half or abs(v - v0) > half:
-                        continue
-                    re += _DOUBLE_COS[index.angle[i]]
-                    im += _DOUBLE_SIN[index.angle[i]]
-        size = np.hypot(re, im)
-        if size < 1.0:
+                    if (low_col <= index.col[i]) & (index.col[i] <= high_col) & (low_row <= index.row[i]) & (index.row[i] <= high_row):
+                        angle, free = index.angle[i], index.strength[i] < USED
+                        if count < IN_CELL:
+                            cell.angles[k, count], cell.free[k, count] = angle, free
+                            count += 1
+                        if free:
+                            re += _DOUBLE_COS[angle]
+                            im += _DOUBLE_SIN[angle]
+        cell.count[k] = count
+        if np.hypot(re, im) < 1.0:
             continue
         cameras += 1
         angle = 0.5 * np.arctan2(im, re)
         sx, sy, sz = _slope(u0, v0, index.distance)
         ou, ov = np.cos(angle), np.sin(angle)
-        normals[k] = _turn_back(ov * sz, -ou * sz, ou * sy - ov * sx, index.cos[k], index.sin[k])
-        normals[k] /= np.sqrt(np.sum(normals[k] ** 2))
-        weights[k] = 1.0
+        cell.normals[k] = _turn_back(ov * sz, -ou * sz, ou * sy - ov * sx, index.cos[k], index.sin[k])
+        cell.normals[k] /= np.sqrt(np.sum(cell.normals[k] ** 2))
+        cell.weights[k] = 1.0
     if cameras < least:
         return np.zeros(3), cameras
-    return solve_direction(normals, weights, unit(np.array((0.1, 1.0, 0.05)))), cameras
+    return solve_direction(cell.normals, cell.weights, unit(np.array((0.1, 1.0, 0.05)))), cameras
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _promise(index, centre, cell, direction, gate):
+def _promise(index, centre, direction, gate, cell):
     """The most evidence that a hair through a cell along a direction may have: by the cameras that see something turned like it in
     the cell, and by the shares of this that no curve stands on. A tenth of the time that looking at it takes."""
     agreeing = shares = 0.0
-    half = 0.75 * cell
     for k in range(len(index.cos)):
+        if cell.count[k] == 0:
+            continue
         frame = hair_frame(index, k, centre, direction)
         if frame.size < LEAST_SIZE:
             continue
-        u0, v0, w0 = frame.p
-        first_frame, last_frame = frames_between(index, k, w0 - cell, w0 + cell)
-        s0, s1, b0, b1 = cell_range(index, u0, v0, half, half)
         free = there = 0
-        for strip in range(s0, s1):
-            for block in range(b0, b1):
-                start, stop = run_of(index, k, strip, block, first_frame, last_frame)
-                for i in range(start, stop):
-                    u, v = image_of(index, i, strip, block)
-                    off = index.angle[i] * (np.pi / ANGLE_STEPS) - frame.angle
-                    off -= np.pi * np.floor(off * (1 / np.pi) + 0.5)
-                    here = (abs(u - u0) <= half) & (abs(v - v0) <= half) & (abs(off) <= gate)
-                    there += here
-                    free += here & (index.strength[i] < USED)
+        for i in range(cell.count[k]):
+            off = cell.angles[k, i] * (np.pi / ANGLE_STEPS) - frame.angle
+            off -= np.pi * np.floor(off * (1 / np.pi) + 0.5)
+            here = abs(off) <= gate
+            there += here
+            free += here & cell.free[k, i]
         agreeing += free >= SEEN_AT_ALL
         shares += free / max(there, 1)
     return min(agreeing * PROMISED[0], shares * PROMISED[1])
@@ -351,14 +384,14 @@ def _grow_seeds(index, seeds, cell, least, box, state, evidence, begin, end, sto
     """Grow every seed (n, 3) of enough evidence on the same observations. Curve b is state[b, begin[b]:end[b]], the seed in the
     middle of the row; strength[b] is the evidence of the seed, or what it may have at most."""
     middle = state.shape[1] // 2
-    view = new_view(len(index.cos))
+    view, inside = new_view(len(index.cos)), _new_cell(len(index.cos))
     for b in range(len(seeds)):
         begin[b] = end[b] = middle
         strength[b] = 0.0
-        direction, cameras = _seed_direction(index, seeds[b], cell, box.min_seed_cameras)
+        direction, cameras = _seed_direction(index, seeds[b], cell, box.min_seed_cameras, inside)
         if cameras < box.min_seed_cameras:
             continue
-        strength[b] = _promise(index, seeds[b], cell, direction, GATE * box.sigma_angle)
+        strength[b] = _promise(index, seeds[b], direction, GATE * box.sigma_angle, inside)
         if strength[b] < least:
             continue
         strength[b], p, g, bend = _snap(index, seeds[b], direction, least, box, view)
@@ -383,24 +416,60 @@ def _seed_grid(index: Index, params: GrowParams) -> _Grid:
 
 @dataclass(frozen=True)
 class Seeds:
-    """Places where a fiber may begin, most promising first."""
+    """Places where a fiber may begin: cells of a grid. Its layers are tried in PHASES, those of one phase far apart, and what is free is
+    counted anew for each: a fiber crosses many layers, and what it stands on is used up by then."""
 
-    centres: np.ndarray  # (n, 3) mm
-    bound: np.ndarray  # (n,) the most evidence that each can have: as many as cameras recorded it, and what was found there; falls
+    grid: _Grid
+    tried: list[tuple[np.ndarray, np.ndarray]]  # of each phase: the cells (n,) that were tried, ascending, and the evidence (n,) found
+
+    def promising(self, pool: ThreadPoolExecutor, index: Index, phase: int, least: float) -> np.ndarray:
+        """The cells (n,) int64 of a phase that may have evidence of ``least``, by the features that no curve stands on yet and by
+        what was found there before; most promising first."""
+        cells, bound = self._free(pool, index, phase, max(least / PROMISED[0], SEEN_BY))
+        known, found = self.tried[phase]
+        if len(known):
+            at = np.minimum(np.searchsorted(known, cells), len(known) - 1)
+            bound = np.where(known[at] == cells, np.minimum(found[at], bound), bound)
+        cells, bound = cells[bound >= least], bound[bound >= least]
+        shuffled = np.random.default_rng(0).permutation(len(cells))  # neighbours in a batch would grow the same fiber
+        return cells[shuffled[np.argsort(-bound[shuffled], kind="stable")]]
+
+    def _free(self, pool: ThreadPoolExecutor, index: Index, phase: int, least: float) -> tuple[np.ndarray, np.ndarray]:
+        """The cells (n,) of a phase in which at least so many sweeps have something free, ascending, and the evidence that may have."""
+        (nx, ny, nz), layers = self.grid.shape, self._layers(phase)
+
+        def work(part: slice) -> tuple[np.ndarray, np.ndarray]:
+            number = np.full(ny, -1)
+            number[layers[part]] = np.arange(len(layers[part]))
+            sweeps = np.zeros((len(layers[part]), nx, nz), np.uint8)
+            _raster(index, self.grid, number, RECORDED, sweeps)
+            at = np.flatnonzero(sweeps >= least)
+            return layers[part][at // (nx * nz)] * (nx * nz) + at % (nx * nz), PROMISED[0] * sweeps.ravel()[at]
+
+        half = -(-len(layers) // RASTERED)
+        parts = list(pool.map(work, [slice(i, i + half) for i in range(0, len(layers), max(half, 1))]))
+        return tuple(np.concatenate([part[i] for part in parts] or [np.zeros(0, int)]) for i in range(2))
+
+    def _layers(self, phase: int) -> np.ndarray:
+        return np.arange(phase, self.grid.shape[1], PHASES)
+
+    def centres(self, cells: np.ndarray) -> np.ndarray:
+        """Middles (n, 3) mm of cells (n,)."""
+        nx, _, nz = self.grid.shape
+        layer, rest = np.divmod(cells, nx * nz)
+        return self.grid.low + (np.stack([rest // nz, layer, rest % nz], -1) + 0.5) * self.grid.cell
+
+    def tell(self, phase: int, cells: np.ndarray, found: np.ndarray) -> None:
+        """Remember the evidence found (n,) in cells (n,) of a phase."""
+        known, before = self.tried[phase]
+        cells, found = np.concatenate([cells, known]), np.concatenate([found, before])
+        cells, first = np.unique(cells, return_index=True)
+        self.tried[phase] = cells, found[first]
 
 
 def find_seeds(index: Index, params: GrowParams) -> Seeds:
-    """The cells that at least ``min_seed_cameras`` sweeps recorded, most angles first."""
-    grid = _seed_grid(index, params)
-    masks = np.zeros(grid.shape, np.uint64)
-    _raster(index, grid, masks)
-    counts = _bits(masks)
-    cells = np.flatnonzero(counts.ravel() >= params.min_seed_cameras)
-    found = counts.ravel()[cells]
-    shuffled = np.random.default_rng(0).permutation(len(cells))  # neighbours in a batch would grow the same fiber
-    order = shuffled[np.argsort(-found[shuffled].astype(int), kind="stable")]
-    where = np.stack(np.unravel_index(cells[order], grid.shape), -1)
-    return Seeds(grid.low + (where + 0.5) * grid.cell, counts.ravel()[cells[order]].astype(float))
+    """Seeds of which none has been tried."""
+    return Seeds(_seed_grid(index, params), [(np.zeros(0, np.int64), np.zeros(0)) for _ in range(PHASES)])
 
 
 # ---- the whole -------------------------------------------------------------------------------------------------------
@@ -418,17 +487,21 @@ def grow(index: Index, params: GrowParams, workers: int = 1, progress: Progress 
     seeds = seeds or find_seeds(index, params)
     store = _BatchStore.of(BATCH, 2 * min(box.max_points, _longest(index, params)) + 1)
     curves: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    tried, steps = 0, len(params.seed_evidence) * PHASES
     with ThreadPoolExecutor(workers) as pool:
         for number, share in enumerate(params.seed_evidence):
-            least = share * params.min_evidence
-            promising = np.flatnonzero(seeds.bound >= least)
-            for first in range(0, len(promising), BATCH):
-                progress("growing", number + first / max(len(promising), 1), len(params.seed_evidence))
-                chosen = promising[first : first + BATCH]
-                seeds.bound[chosen] = _grow_batch(pool, index, seeds.centres[chosen], least, params, box, store)
-                curves += _accept(pool, index, store, len(chosen), params.mean_share * least, params, claims)
-    progress("growing", len(params.seed_evidence), len(params.seed_evidence))
-    return _flat(curves, len(seeds.centres))
+            least = max(share * params.min_evidence, 1e-6)
+            for step, phase in enumerate(FAR_FIRST):
+                cells, found = seeds.promising(pool, index, phase, least), []
+                for first in range(0, len(cells), BATCH):
+                    progress("growing", number * PHASES + step + first / len(cells), steps)
+                    centres = seeds.centres(cells[first : first + BATCH])
+                    found.append(_grow_batch(pool, index, centres, least, params, box, store))
+                    curves += _accept(pool, index, store, len(centres), params.mean_share * least, params, claims)
+                seeds.tell(phase, cells, np.concatenate([*found, np.zeros(0)]))
+                tried += len(cells)
+    progress("growing", steps, steps)
+    return _flat(curves, tried)
 
 
 def _grow_batch(pool: ThreadPoolExecutor, index: Index, seeds: np.ndarray, least: float, params: GrowParams, box: Box, store: "_BatchStore"):

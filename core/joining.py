@@ -5,6 +5,7 @@ Nothing here looks at observations; ``refine.py`` does, and asks.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -12,7 +13,9 @@ from scipy.spatial import cKDTree
 
 from .stops import Stop
 
-END = 7  # points of a curve that tell the direction of its end
+AHEAD, TOUCHING_MM = 0.7, 0.15  # cosine within which two ends look at each other, unless they are so near
+PAIRS = 200_000  # that are compared together
+END_MM = 0.6  # of a curve that tells the direction of its end
 
 
 @dataclass(frozen=True)
@@ -87,21 +90,29 @@ def once(curves: Sequence[Curve], same_mm: float, step_mm: float) -> list[Curve]
 
 def end_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Place and outward unit direction of the last of points (n, 3)."""
-    back = points[-min(END, len(points)) :]
-    slope = np.polyfit(np.arange(len(back)) - (len(back) - 1), back, 2)[1] if len(back) > 4 else back[-1] - back[0]
+    count = max(round(END_MM / np.linalg.norm(points[-1] - points[-2])), 2) + 1
+    back = points[-min(count, len(points)) :]
+    slope = _parabola_slope(len(back)) @ back if len(back) > 3 else back[-1] - back[0]
     return back[-1], slope / np.linalg.norm(slope)
 
 
-def misfit(place_a, way_a, place_b, way_b, place_mm: tuple[float, float], turn_deg: tuple[float, float]) -> float:
-    """How ill two ends, with outward directions, go together, squared. Each is carried on straight to the middle of the gap, since a
-    bend that is even over the gap moves both alike; place_mm and turn_deg are what is expected, and as much more a mm of gap."""
-    gap = place_b - place_a
-    size, mean = np.linalg.norm(gap), way_a - way_b
-    miss = gap - 0.5 * size * mean
-    mean = mean / (np.linalg.norm(mean) + 1e-12)
-    miss = np.linalg.norm(miss - mean * (miss @ mean))
-    bent = np.degrees(np.arccos(np.clip(-way_a @ way_b, -1, 1)))
-    return float((miss / (place_mm[0] + place_mm[1] * size)) ** 2 + (bent / (turn_deg[0] + turn_deg[1] * size)) ** 2)
+@lru_cache
+def _parabola_slope(count: int) -> np.ndarray:
+    """Weights (count,) that give the slope at the last of so many places of the parabola that fits them best."""
+    return np.linalg.pinv(np.vander(np.arange(1 - count, 1), 3))[1]
+
+
+def misfit(place_a, way_a, place_b, way_b, place_mm: tuple[float, float], turn_deg: tuple[float, float]) -> np.ndarray:
+    """How ill two ends, with outward directions, go together, squared: (...) of vectors (..., 3). Each is carried on straight to the
+    middle of the gap, since a bend that is even over the gap moves both alike; place_mm and turn_deg are what is expected, and
+    as much more a mm of gap."""
+    gap, mean = place_b - place_a, way_a - way_b
+    size = np.linalg.norm(gap, axis=-1)
+    miss = gap - 0.5 * size[..., None] * mean
+    mean = mean / (np.linalg.norm(mean, axis=-1) + 1e-12)[..., None]
+    miss = np.linalg.norm(miss - mean * np.sum(miss * mean, axis=-1)[..., None], axis=-1)
+    bent = np.degrees(np.arccos(np.clip(-np.sum(way_a * way_b, axis=-1), -1, 1)))
+    return (miss / (place_mm[0] + place_mm[1] * size)) ** 2 + (bent / (turn_deg[0] + turn_deg[1] * size)) ** 2
 
 
 def meetings(curves: Sequence[Curve], within_mm: float, place_mm, turn_deg, most: float) -> list[Meeting]:
@@ -109,15 +120,18 @@ def meetings(curves: Sequence[Curve], within_mm: float, place_mm, turn_deg, most
     if len(curves) < 2:
         return []
     places, ways = (np.array(a) for a in zip(*(end_of(leading_to(curves, e).points) for e in range(2 * len(curves))), strict=True))
+    pairs = cKDTree(places).query_pairs(within_mm, output_type="ndarray")
+    pairs = pairs[np.lexsort(pairs.T[::-1])]
+    pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
     found = []
-    for a, b in sorted(cKDTree(places).query_pairs(within_mm)):
+    for some in np.array_split(pairs, len(pairs) // PAIRS + 1):
+        a, b = some.T
         gap = places[b] - places[a]
-        size = float(np.linalg.norm(gap))
-        if a // 2 == b // 2 or (size > 0.15 and (gap @ ways[a] < 0.7 * size or -gap @ ways[b] < 0.7 * size)):
-            continue
+        size = np.linalg.norm(gap, axis=1)
+        ahead = np.minimum(np.sum(gap * ways[a], axis=1), -np.sum(gap * ways[b], axis=1)) >= AHEAD * size
         ill = misfit(places[a], ways[a], places[b], ways[b], place_mm, turn_deg)
-        if ill <= most:
-            found.append(Meeting((a, b), size, ill))
+        good = (ahead | (size <= TOUCHING_MM)) & (ill <= most)
+        found += [Meeting((int(i), int(j)), float(s), float(m)) for i, j, s, m in zip(a[good], b[good], size[good], ill[good], strict=True)]
     return found
 
 
@@ -184,18 +198,18 @@ def passings(curves: Sequence[Curve], within_mm: float, turn_deg: float, inner: 
     more than turn_deg; in a fixed order."""
     if len(curves) < 2:
         return []
-    points = np.concatenate([c.points for c in curves])
-    starts = np.r_[0, np.cumsum([len(c.points) for c in curves])]
-    owner, tree, found = np.repeat(np.arange(len(curves)), np.diff(starts)), cKDTree(points), []
-    for end in range(2 * len(curves)):
-        place, way = end_of(leading_to(curves, end).points)
-        for other in np.unique(owner[tree.query_ball_point(place, within_mm)]):
-            line = curves[other].points
-            at = int(np.argmin(np.linalg.norm(line - place, axis=1)))
-            if other == end // 2 or not inner <= at < len(line) - inner:
-                continue
-            along = line[at + 2] - line[at - 2]
-            turn = along @ way / np.linalg.norm(along)
-            if abs(turn) >= np.cos(np.radians(turn_deg)):
-                found.append(Passing(end, int(other), at, bool(turn > 0)))
-    return found
+    places, ways = (np.array(a) for a in zip(*(end_of(leading_to(curves, e).points) for e in range(2 * len(curves))), strict=True))
+    points, lengths = np.concatenate([c.points for c in curves]), np.array([len(c.points) for c in curves])
+    owner, starts = np.repeat(np.arange(len(curves)), lengths), np.r_[0, np.cumsum(lengths)]
+    balls = cKDTree(points).query_ball_point(places, within_mm)
+    end, near = np.repeat(np.arange(len(places)), [len(ball) for ball in balls]), np.concatenate([*balls, []]).astype(np.int64)
+    order = np.lexsort((near, np.linalg.norm(points[near] - places[end], axis=1), owner[near], end))
+    end, near, other = end[order], near[order], owner[near[order]]
+    nearest = np.r_[True, (np.diff(end) != 0) | (np.diff(other) != 0)][: len(end)]  # of each other curve
+    at = near - starts[other]
+    good = nearest & (other != end // 2) & (at >= max(inner, 2)) & (at < lengths[other] - max(inner, 2))
+    end, near, other, at = end[good], near[good], other[good], at[good]
+    along = points[near + 2] - points[near - 2]
+    turn = np.sum(along * ways[end], axis=1) / np.linalg.norm(along, axis=1)
+    held = np.abs(turn) >= np.cos(np.radians(turn_deg))
+    return [Passing(int(e), int(o), int(p), bool(t > 0)) for e, o, p, t in zip(end[held], other[held], at[held], turn[held], strict=True)]

@@ -5,9 +5,10 @@ A curve is a smoothing spline (``spline.py``): a point every step, tied to the o
 observations likeliest. What compares curves with each other is in ``joining.py``.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -24,13 +25,17 @@ from .stops import Stop
 
 _turn_back = njit(turn_back)
 JERKS_PER_MM2 = tuple(0.015 * 2.0**i for i in range(9))  # change of curvature a mm, at random each step, from straight hair to tight curls
+SLAB_MM = 0.1
 GROWING_SHARE = 0.6  # of the time of a round
 BEND_PX = 3.6  # sigma along the hair of what places a ridge, hair's width and slab included: it sees a bend from inside
-JOIN_PART, JOIN_BESIDE = 40, 2  # points of either curve that a join looks at, and those of the end itself
-BEND_STEPS = 4  # to either side: the length over which a curvature is told
+JOIN_PART_MM, JOIN_BESIDE_MM = 4.0, 0.2  # of either curve that a join looks at, and of the end itself
+BEND_MM = 0.4  # to either side: the length over which a curvature is told
+CHORD_MM, KNOWN_MM = 0.2, 2.0  # to either side: what gives a point its direction; and the end of a curve that tells where it goes on
 STRAIGHT = 1e-3  # 1/mm: hair is taken for no straighter
 UNCROSS_MM, UNCROSS_DEG = 0.2, 20.0  # how near an end must be to another curve to claim the rest of it, and how much turned
-UNCROSS_INNER = 12  # points to either side of the nearest, of which one is the weakest of the other curve
+UNCROSS_INNER_MM = 1.2  # to either side of the nearest point, where one is the weakest of the other curve
+UNCROSS_EDGE_MM = 0.2  # left out of either where they are put together
+SHORT_MM = 0.8  # pieces shorter than this tell no direction
 LEAST_DIP = 0.3  # evidence: less is not told apart
 STIFF = 10.0  # cameras: what holds a point in its place along the hair
 
@@ -40,7 +45,7 @@ class RefineParams:
     """How curves are grown in rounds, fitted, cut and joined."""
 
     rounds: int = 3  # of the fit: ties are found anew where the curve has moved
-    slab_px: float = 0.2  # error of what one camera says of one step of a curve, rows and frames that err alike included
+    slab_px: float = 0.2  # error of what one camera says of SLAB_MM of a curve, rows and frames that err alike included
     fit_sigma: tuple[float, float] = (0.4, 0.2)  # weight of an observation in a fit, by its way across the hair (px) and from focus (mm)
     near_mm: float = 0.6  # evidence of a point is that of this length around it
     step_evidence: tuple[float, float, float] = (1.5, 0.8, 0.3)  # evidence that a step needs in the rounds of ``trace``
@@ -55,7 +60,7 @@ class RefineParams:
     join_least: float = 1.0  # odds that a join needs
     join_margin: float = 1.0  # by which it must be likelier than any other of the same end
     uncross: float = 2.5  # times more evidence that a way needs to take the place of another
-    carry_mm: float = 0.3  # curves are carried on beyond their ends by this, where their error is less than
+    carry_mm: float = 0.4  # curves are carried on beyond their ends by this, where their error is less than
     carry_error_mm: float = 0.015
     apart_mm: float = 0.06  # and other curves are not nearer than this: hairs are 0.06 mm thick or more
     same_mm: float = 0.04  # closer than this to a better curve, along it, a curve is the same hair
@@ -66,15 +71,50 @@ class RefineParams:
 # ---- the fit ---------------------------------------------------------------------------------------------------------
 
 
+class Seen(NamedTuple):
+    """What S cameras see of a curve of n points: observations within half a step along the hair of each."""
+
+    across: np.ndarray  # (h,) float32 mm, of each observation
+    weight: np.ndarray  # (h,) float32
+    ends: np.ndarray  # (n S + 1,) int64: where those of each point and camera begin
+    ribbon: np.ndarray  # (n, S, 3) t, across the ribbon of the camera
+    thin: np.ndarray  # (n, S) square of how long a mm of hair is in the image
+
+
 @njit(cache=True, nogil=True, fastmath=True)
-def _tie(index, points, box, normal, right):
-    """What the cameras say of each point (n, 3): the sums normal (n, 3, 3) and right (n, 3) of its least squares, in cameras
-    that see it fully. Observations are those within half a step along the hair; their place is that of the hair's image
+def _seen(index, points, box):
+    """What the cameras see (Seen) of a curve of points (n, 3). A move of less than what the weights reach needs no new look."""
+    n, cameras = len(points), len(index.cos)
+    hits, count = new_hits(1), 0
+    across, weight = np.empty(128 * n, np.float32), np.empty(128 * n, np.float32)
+    ends, ribbon, thin = np.zeros(n * cameras + 1, np.int64), np.zeros((n, cameras, 3)), np.ones((n, cameras))
+    for j in range(n):
+        g = chord(points, j)
+        for k in range(cameras):
+            frame, found = hair_frame(index, k, points[j], g), 0
+            if shows(index, k, frame):
+                found = gather(index, k, frame, 0.0, 0.0, box, hits, 0)
+                ribbon[j, k] = _turn_back(frame.t[0], frame.t[1], frame.t[2], index.cos[k], index.sin[k])
+                thin[j, k] = frame.size * frame.size
+            if count + found > len(across):
+                more = np.empty((2, 2 * (count + found)), np.float32)
+                more[0, :count], more[1, :count] = across[:count], weight[:count]
+                across, weight = more[0], more[1]
+            across[count : count + found], weight[count : count + found] = hits.across[:found], hits.weight[:found]
+            count += found
+            ends[j * cameras + k + 1] = count
+    return Seen(across[:count].copy(), weight[:count].copy(), ends, ribbon, thin)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _tie(seen, points, move, box, normal, right):
+    """What the cameras say of each point (n, 3), moved by ``move`` (n, 3) since they were asked: the sums normal (n, 3, 3) and
+    right (n, 3) of its least squares, in cameras that see it fully. The place of an observation is that of the hair's image
     averaged along it, which lies by half the curvature times BEND_PX squared inside a bend."""
-    n = len(points)
-    reach = min(4, (n - 1) // 2)
-    inside = 0.5 * (BEND_PX * index.pitch) ** 2
-    hits = new_hits(1)
+    n, cameras, f32 = len(points), seen.ribbon.shape[1], np.float32
+    reach = min(max(round(BEND_MM / box.step), 1), (n - 1) // 2)
+    inside = 0.5 * (BEND_PX * box.pixel) ** 2
+    over, bow, one, none = f32(1 / box.sigma), f32(BOW), f32(1), f32(0)
     for j in range(n):
         g = chord(points, j)
         bend = np.zeros(3)
@@ -85,64 +125,101 @@ def _tie(index, points, box, normal, right):
             right[j, c] = 0.0
             for d in range(3):
                 normal[j, c, d] = STIFF * g[c] * g[d]
-        for k in range(len(index.cos)):
-            frame = hair_frame(index, k, points[j], g)
-            if not shows(index, k, frame):
+        for k in range(cameras):
+            first, last = seen.ends[j * cameras + k], seen.ends[j * cameras + k + 1]
+            if first == last:
                 continue
-            count = gather(index, k, frame, 0.0, 0.0, box, hits, 0)
-            s = r = 0.0
-            for i in range(count):
-                x = hits.across[i] / box.sigma
-                x = max(1 - BOW * x * x, 0.0)
-                w = hits.weight[i] * x * x
+            t = seen.ribbon[j, k]
+            moved = f32(t[0] * move[j, 0] + t[1] * move[j, 1] + t[2] * move[j, 2])
+            offs, weights, s, r = seen.across[first:last], seen.weight[first:last], none, none
+            for i in range(len(offs)):
+                off = offs[i] - moved
+                x = off * over
+                x = max(one - bow * x * x, none)
+                w = weights[i] * x * x
                 s += w
-                r += w * hits.across[i]
+                r += w * off
             if s < 1e-6:
                 continue
-            share, t = min(s / box.full_support, 1.0), np.empty(3)
-            t[0], t[1], t[2] = _turn_back(frame.t[0], frame.t[1], frame.t[2], index.cos[k], index.sin[k])
-            place = r / s - inside * (t[0] * bend[0] + t[1] * bend[1] + t[2] * bend[2]) / (frame.size * frame.size)
+            share = min(np.float64(s) / box.full_support, 1.0)
+            place = np.float64(r) / np.float64(s) - inside * (t[0] * bend[0] + t[1] * bend[1] + t[2] * bend[2]) / seen.thin[j, k]
             for c in range(3):
                 right[j, c] += share * place * t[c]
                 for d in range(3):
                     normal[j, c, d] += share * t[c] * t[d]
 
 
-def _ties(index: Index, points: np.ndarray, box: Box, params: RefineParams, bend: float) -> tuple[np.ndarray, np.ndarray, Stiffness]:
-    """What ``_tie`` says of points (n, 3), in units of its errors, and the stiffness that makes it likeliest; ``bend`` is the curvature
-    (1/mm) of the hair at large."""
+class Ties(NamedTuple):
+    """What holds a curve of n points in its place, in units of the errors of what the cameras say."""
+
+    normal: np.ndarray  # (n, 3, 3)
+    right: np.ndarray  # (n, 3)
+    stiff: Stiffness  # the likeliest
+
+
+def _tied(seen: Seen, points: np.ndarray, move: np.ndarray, box: Box, params: RefineParams, stiffs: Sequence[Stiffness], start: int):
+    """The Ties of points (n, 3), the points that fit them best, and which of ``stiffs`` is the likeliest, found upwards or
+    downwards from number ``start``."""
     normal, right = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
-    _tie(index, points, box, normal, right)
-    error = params.slab_px * index.pitch
+    _tie(seen, points, move, box, normal, right)
+    error = params.slab_px * box.pixel * np.sqrt(SLAB_MM / box.step)
     normal, right = normal / error**2, right / error**2
-    choices = [stiffness(box.step, jerk, bend) for jerk in JERKS_PER_MM2]
-    return normal, right, max(choices, key=lambda stiff: smoothed(points, normal, right, stiff)[1])
+    fits = {start: smoothed(points, normal, right, stiffs[start])}
+    best = start
+    for way in (1, -1):
+        while 0 <= best + way < len(stiffs):
+            if best + way not in fits:
+                fits[best + way] = smoothed(points, normal, right, stiffs[best + way])
+            if fits[best + way][1] <= fits[best][1]:
+                break
+            best += way
+    return Ties(normal, right, stiffs[best]), fits[best][0], best
+
+
+def _fit(index: Index, points: np.ndarray, box: Box, params: RefineParams, bend: float) -> tuple[np.ndarray, Ties]:
+    """Points (n, 3) of a curve fitted to its observations, as stiff as these make likely (empirical Bayes), and the Ties of the last
+    round; ``bend`` is the curvature (1/mm) of the hair at large."""
+    stiffs = [stiffness(box.step, jerk, bend) for jerk in JERKS_PER_MM2]
+    begun, best = np.ascontiguousarray(points), len(stiffs) // 2
+    seen = _seen(index, begun, box)
+    points = begun
+    for _ in range(params.rounds):
+        held, points, best = _tied(seen, points, points - begun, box, params, stiffs, best)
+    return np.ascontiguousarray(points), held
+
+
+def ties(index: Index, points: np.ndarray, box: Box, params: RefineParams, bend: float) -> Ties:
+    """What holds the points (n, 3) of a curve in their place, where they are."""
+    return _fit(index, points, box, replace(params, rounds=1), bend)[1]
 
 
 def _fitted(index: Index, points: np.ndarray, box: Box, params: RefineParams, bend: float) -> np.ndarray:
-    """Points (n, 3) of a curve fitted to its observations, as stiff as these make likely (empirical Bayes)."""
-    for _ in range(params.rounds):
-        normal, right, stiff = _ties(index, points, box, params, bend)
-        points = np.ascontiguousarray(smoothed(points, normal, right, stiff)[0])
-    return points
+    """The points of ``_fit``."""
+    return _fit(index, points, box, params, bend)[0]
+
+
+def steps_of(length_mm: float, step_mm: float) -> int:
+    """How many steps are nearest to a length, one at least."""
+    return max(round(length_mm / step_mm), 1)
 
 
 def _bends(points: np.ndarray, step_mm: float) -> np.ndarray:
-    """Squares (m,) of the curvature (1/mm) of a curve of points (n, 3) in one direction across it, over BEND_STEPS to either side, at
-    all points that have as many."""
-    if len(points) <= 2 * BEND_STEPS:
+    """Squares (m,) of the curvature (1/mm) of a curve of points (n, 3) in one direction across it, over BEND_MM to either side, at
+    all points that have as much."""
+    half = steps_of(BEND_MM, step_mm)
+    if len(points) <= 2 * half:
         return np.zeros(0)
-    bends = points[2 * BEND_STEPS :] + points[: -2 * BEND_STEPS] - 2 * points[BEND_STEPS:-BEND_STEPS]
-    return 0.5 * np.sum(bends**2, axis=1) / (BEND_STEPS * step_mm) ** 4
+    bends = points[2 * half :] + points[: -2 * half] - 2 * points[half:-half]
+    return 0.5 * np.sum(bends**2, axis=1) / (half * step_mm) ** 4
 
 
 def bend_at_large(curves: Iterable[tuple[np.ndarray, np.ndarray]], step_mm: float) -> float:
     """Curvature (1/mm) of the hair in one direction across it, root mean square, where it is seen well; of curves as points (n, 3) and
     evidence (n,)."""
-    bends, seen = [np.zeros(0)], [np.zeros(0)]
+    half, bends, seen = steps_of(BEND_MM, step_mm), [np.zeros(0)], [np.zeros(0)]
     for points, evidence in curves:
         bends.append(_bends(points, step_mm))
-        seen.append(evidence[BEND_STEPS : BEND_STEPS + len(bends[-1])])
+        seen.append(evidence[half : half + len(bends[-1])])
     bends, seen = np.concatenate(bends), np.concatenate(seen)
     return max(float(np.sqrt(bends[seen >= np.median(seen)].mean())), STRAIGHT) if len(bends) else np.inf
 
@@ -151,16 +228,20 @@ def bend_at_large(curves: Iterable[tuple[np.ndarray, np.ndarray]], step_mm: floa
 def _weigh(index, points, box, evidence):
     """Evidence (n,) of each point (n, 3) of a curve that is already where it should be."""
     n = len(points)
-    view, free = new_view(len(index.cos)), (1e9, 1e9, 1e9)
+    view, free, reach = new_view(len(index.cos)), (1e9, 1e9, 1e9), max(round(CHORD_MM / box.step), 1)
     for j in range(n):
-        a, b = max(j - 2, 0), min(j + 2, n - 1)
+        if j % 2 == 1 and j < n - 1:  # the boxes of neighbours share two thirds
+            continue
+        a, b = max(j - reach, 0), min(j + reach, n - 1)
         m = (a + b) // 2
         g = chord(points, j)
         half = 0.5 * (b - a) * box.step
-        bend = (points[a] + points[b] - 2 * points[m]) / (half * half) if b - a == 4 else np.zeros(3)
+        bend = (points[a] + points[b] - 2 * points[m]) / (half * half) if b - a == 2 * reach else np.zeros(3)
         bend -= g * (g[0] * bend[0] + g[1] * bend[1] + g[2] * bend[2])
         look(index, points[j], g, bend, box, view)
         _, evidence[j], _, _, _ = fit(view, index.around, g, box, 1.0, free)
+    for j in range(1, n - 1, 2):
+        evidence[j] = 0.5 * (evidence[j - 1] + evidence[j + 1])
 
 
 # ---- growing on ------------------------------------------------------------------------------------------------------
@@ -171,18 +252,18 @@ def _grow_on(index, points, box, state, evidence):
     """Grow on from the last of points (n, 3); fills state (m, 9) and evidence (m,), which begin with the points' own last
     ones. Returns (rows of the points', rows there are, Stop)."""
     n = len(points)
-    known = min(20, n)
+    known, reach = min(max(round(KNOWN_MM / box.step), 1), n), max(round(CHORD_MM / box.step), 1)
     for i in range(known):
         j = n - known + i
-        a, b = max(j - 2, 0), min(j + 2, n - 1)
+        a, b = max(j - reach, 0), min(j + reach, n - 1)
         m = (a + b) // 2
         g = points[b] - points[a]
         size = np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         one, two = points[b] - points[m], points[m] - points[a]
         l1, l2 = np.sqrt(np.sum(one**2)), np.sqrt(np.sum(two**2))
         state[i, :3], state[i, 3:6] = points[j], g / size
-        state[i, 6:] = (one / l1 - two / l2) / (0.5 * (l1 + l2)) if b - a == 4 else np.zeros(3)
-        if b - a < 4 and i > 1 and j > 1:  # at the end itself the middle of a chord says nothing of the direction
+        state[i, 6:] = (one / l1 - two / l2) / (0.5 * (l1 + l2)) if b - a == 2 * reach else np.zeros(3)
+        if b - a < 2 * reach and i > 1 and j > 1:  # at the end itself the middle of a chord says nothing of the direction
             bend = state[i - 1, 6:].copy()
             state[i, 6:] = bend
             way = state[i - 1, 3:6] + box.step * bend
@@ -242,11 +323,14 @@ def trace(index: Index, grow_params: GrowParams, params: RefineParams, workers: 
                 index.strength[:] &= USED - 1
                 curves = stage(curves, work)
             curves = _keep(curves, work)
+            alive = set(map(id, curves))
+            for key in [key for key, (told_of, _) in memo.items() if not alive.issuperset(map(id, told_of))]:
+                del memo[key]
             if number == len(params.step_evidence) - 1:
                 work.index.strength[:] &= USED - 1
                 curves = _carry_on(curves, work)
     progress("growing", 1, 1)
-    return _flat(curves, len(seeds.centres))
+    return _flat(curves, sum(len(cells) for cells, _ in seeds.tried))
 
 
 def _part_of(progress: Progress, number: int, rounds: int) -> Progress:
@@ -278,7 +362,11 @@ def _curves(grown: Grown) -> list[Curve]:
 def _mark(curves: list[Curve], work: _Work) -> None:
     """Mark the observations that curves stand on as used, and no others."""
     work.index.strength[:] &= USED - 1
-    for numbers in work.each(lambda curve: claimed(work.index, curve.points, work.claims), curves):
+
+    def claim(curve: Curve) -> np.ndarray:
+        return _remembered(work, ("claimed",), (curve,), lambda: claimed(work.index, np.ascontiguousarray(curve.points), work.claims))
+
+    for numbers in work.each(claim, curves):
         work.index.strength[numbers] |= USED
 
 
@@ -302,13 +390,13 @@ def _fit_all(curves: list[Curve], work: _Work) -> list[Curve]:
 
 def _cut_all(curves: list[Curve], work: _Work) -> list[Curve]:
     """Cut off ends that have less evidence than their steps need."""
-    out = []
+    out, least = [], steps_of(BEND_MM, work.box.step)
     for curve in curves:
         surplus = np.concatenate([[0.0], np.cumsum(curve.evidence - work.box.min_evidence)])
         low = np.minimum.accumulate(surplus)
         last = int(np.argmax(surplus - low))
         first = int(np.argmin(surplus[: last + 1]))
-        if last - first >= 4:
+        if last - first >= least:
             out.append(part(curve, first, last))
     return out
 
@@ -339,12 +427,13 @@ def _join_worth(meeting: Meeting, evidence: float, params: RefineParams) -> floa
 
 
 def _between(curves: list[Curve], meeting: Meeting, work: _Work, bend: float) -> float:
-    """Mean evidence over the gap between two ends, and JOIN_BESIDE to either side, of the one curve that fits both."""
+    """Mean evidence over the gap between two ends, and JOIN_BESIDE_MM to either side, of the one curve that fits both."""
+    most, beside = steps_of(JOIN_PART_MM, work.box.step), steps_of(JOIN_BESIDE_MM, work.box.step)
     parts = [leading_to(curves, meeting.ends[0]), turned(leading_to(curves, meeting.ends[1]))]
-    parts = [part(parts[0], max(len(parts[0].points) - JOIN_PART, 0), len(parts[0].points)), part(parts[1], 0, min(JOIN_PART, len(parts[1].points)))]
+    parts = [part(parts[0], max(len(parts[0].points) - most, 0), len(parts[0].points)), part(parts[1], 0, min(most, len(parts[1].points)))]
     both = bridged(parts, work.box.step)
     points = _fitted(work.index, np.ascontiguousarray(both.points), work.slab, work.params, bend)
-    first, last = len(parts[0].points) - JOIN_BESIDE, len(points) - len(parts[1].points) + JOIN_BESIDE
+    first, last = len(parts[0].points) - beside, len(points) - len(parts[1].points) + beside
     evidence = np.empty(len(points))
     _weigh(work.index, points, work.near, evidence)
     return float(evidence[max(first, 0) : last].mean())
@@ -354,7 +443,7 @@ def _uncross(curves: list[Curve], work: _Work) -> list[Curve]:
     """Where a curve left its fiber for one beside it, and a piece of that one ends there: give the piece what is its own. The weakest
     point of the way that this makes must have more evidence than that of the way there is, by a factor of ``uncross``."""
     bend = _at_large(curves, work)
-    found = passings(curves, UNCROSS_MM, UNCROSS_DEG, UNCROSS_INNER)
+    found = passings(curves, UNCROSS_MM, UNCROSS_DEG, steps_of(UNCROSS_INNER_MM, work.box.step))
 
     def tell(passing: Passing) -> tuple[float, Curve, Curve]:
         pair = curves[passing.end // 2], curves[passing.other]
@@ -378,20 +467,21 @@ def _exchanged(curves: list[Curve], passing: Passing, work: _Work, bend: float) 
     own = leading_to(curves, passing.end)
     other = curves[passing.other] if passing.onward else turned(curves[passing.other])
     at = passing.at if passing.onward else len(other.points) - 1 - passing.at
-    near = slice(at - UNCROSS_INNER + 2, at + UNCROSS_INNER - 1)
+    inner, most, edge = (steps_of(mm, work.box.step) for mm in (UNCROSS_INNER_MM, JOIN_PART_MM, UNCROSS_EDGE_MM))
+    near = slice(at - inner + edge, at + inner - edge + 1)
     dip = near.start + int(np.argmin(other.evidence[near]))
-    own, before, beyond = part(own, 0, len(own.points) - 2), part(other, 0, dip), part(other, dip + 3, len(other.points))
-    if min(map(len, (own.points, before.points, beyond.points))) < 8:
+    own, before, beyond = part(own, 0, len(own.points) - edge), part(other, 0, dip), part(other, dip + edge + 1, len(other.points))
+    if min(map(len, (own.points, before.points, beyond.points))) < steps_of(SHORT_MM, work.box.step):
         return 0.0, own, other
     forward = beyond.points[0] - own.points[-1]
     if forward @ end_of(own.points)[1] < 0.5 * np.linalg.norm(forward):
         return 0.0, own, other
     both = bridged([own, beyond], work.box.step)
-    before_it, after_it = (min(len(c.points), JOIN_PART) for c in (own, beyond))
+    before_it, after_it = (min(len(c.points), most) for c in (own, beyond))
     middle = both.points[len(own.points) - before_it : len(both.points) - len(beyond.points) + after_it]
     points, evidence = _fitted(work.index, np.ascontiguousarray(middle), work.slab, work.params, bend), np.empty(len(middle))
     _weigh(work.index, points, work.near, evidence)
-    weakest = evidence[before_it - 5 : len(points) - after_it + 5].min()
+    weakest = evidence[max(before_it - 2 * edge, 0) : len(points) - after_it + 2 * edge].min()
     return float(weakest / max(other.evidence[dip], LEAST_DIP)), both, before
 
 
@@ -399,7 +489,8 @@ def _carry_on(curves: list[Curve], work: _Work) -> list[Curve]:
     """Carry curves on a little beyond their ends, where nothing supports them, as far as it is known where they go: a hair does not
     end where it is not seen any more. What is carried on has no evidence, and keeps away from other hairs, which are as thick."""
     params, bend = work.params, _at_large(curves, work)
-    count = round(params.carry_mm / work.box.step)
+    count, short = round(params.carry_mm / work.box.step), steps_of(SHORT_MM, work.box.step)
+    known = 2 * steps_of(0.5, work.box.step) + 1
     if not curves:
         return curves
     tree, owner = cKDTree(np.concatenate([c.points for c in curves])), np.repeat(np.arange(len(curves)), [len(c.points) for c in curves])
@@ -407,18 +498,22 @@ def _carry_on(curves: list[Curve], work: _Work) -> list[Curve]:
     def one(number: int) -> Curve:
         curve = curves[number]
         points, evidence = np.ascontiguousarray(curve.points), curve.evidence
-        ends = [0 if stop == Stop.LEFT_VOLUME or len(points) < 12 else count for stop in curve.stops]
+        ends = [0 if stop == Stop.LEFT_VOLUME or len(points) < 1.5 * short else count for stop in curve.stops]
         if any(ends):
-            normal, right, stiff = _ties(work.index, points, work.slab, params, bend)
+            normal, right, stiff = ties(work.index, points, work.slab, params, bend)
             inner = slice(ends[0], ends[0] + len(points))
-            points = np.concatenate([_onward(points[::-1], ends[0])[::-1], points, _onward(points, ends[1])])
+            points = np.concatenate([_onward(points[::-1][-known:], ends[0])[::-1], points, _onward(points[-known:], ends[1])])
             normal, right = np.pad(normal, (ends, (0, 0), (0, 0))), np.pad(right, (ends, (0, 0)))
             points = smoothed(points, normal, right, stiff)[0]
-            good = across(covariance(normal, stiff), points) < params.carry_error_mm
+            error = across(covariance(normal, stiff), points)
+            error[1:-1] = np.where(np.arange(1, len(points) - 1) < inner.start, 0.5 * (error[1:-1] + error[2:]), 0.5 * (error[1:-1] + error[:-2]))
+            good = error < params.carry_error_mm
             good &= np.array([all(owner[near] == number) for near in tree.query_ball_point(points, params.apart_mm)])
             first = inner.start - int(np.cumprod(good[: inner.start][::-1]).sum())
             last = inner.stop + int(np.cumprod(good[inner.stop :]).sum())
             points, evidence = np.ascontiguousarray(points[first:last]), np.pad(evidence, ends)[first:last]
+        if len(points) == len(curve.points) and curve.fitted:
+            return curve
         return Curve(_fitted(work.index, points, work.slab, params, bend), evidence, curve.stops, fitted=True)
 
     return work.each(one, range(len(curves)))
@@ -427,7 +522,7 @@ def _carry_on(curves: list[Curve], work: _Work) -> list[Curve]:
 def _onward(points: np.ndarray, count: int) -> np.ndarray:
     """``count`` points that carry a curve on with the curvature of its end; a start for the fit."""
     step = np.arange(1, count + 1)[:, None]
-    half = 5
+    half = (len(points) - 1) // 2
     bend = (points[-1] + points[-1 - 2 * half] - 2 * points[-1 - half]) / half**2
     way = (points[-1] - points[-1 - half]) / half + 0.5 * half * bend
     return points[-1] + step * way + 0.5 * step**2 * bend
@@ -436,12 +531,13 @@ def _onward(points: np.ndarray, count: int) -> np.ndarray:
 def _extend(curves: list[Curve], work: _Work) -> list[Curve]:
     """Grow on from both ends, on what no curve stands on."""
     _mark(curves, work)
+    short = steps_of(SHORT_MM, work.box.step)
     room = int(10 * work.index.rows * work.index.pitch / work.box.step) + 30
 
     def one(curve: Curve) -> Curve:
         points, evidence, stops = curve.points, curve.evidence, list(curve.stops)
         for end in (1, 0):
-            if stops[end] != Stop.LEFT_VOLUME and len(points) >= 8:
+            if stops[end] != Stop.LEFT_VOLUME and len(points) >= short:
                 state, more = np.empty((room, 9)), np.empty(room, np.float32)
                 known, filled, stop = _grow_on(work.index, np.ascontiguousarray(points), work.box, state, more)
                 points, evidence = np.concatenate([points, state[known:filled, :3]]), np.concatenate([evidence, more[known:filled]])

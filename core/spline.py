@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from scipy.linalg import cho_solve_banded, cholesky_banded
 
 
 class Stiffness(NamedTuple):
@@ -31,33 +30,100 @@ def stiffness(step_mm: float, jerk_per_mm2: float, bend_per_mm: float = np.inf) 
     return Stiffness((step_mm**2 * change) ** -2, np.sqrt(1 - new), (step_mm**2 * bend_per_mm) ** -2)
 
 
+BAND = 9  # elements of the matrix of a fit below its diagonal: three points of three coordinates
+
+
 def smoothed(points: np.ndarray, normal: np.ndarray, right: np.ndarray, stiff: Stiffness) -> tuple[np.ndarray, float]:
     """points (n, 3) moved to the least of: what ``normal`` (n, 3, 3) and ``right`` (n, 3) say of each point's move, and what its
     bends cost; and the logarithm of how likely such ties are if it is so stiff, but for a constant. normal and right in units of
-    the ties' own errors. A banded system, O(n).
+    the ties' own errors. A banded system, O(n); LAPACK's way to solve it takes five times as long, most of it to be called.
     """
     n = len(points)
     if n < 4:
         return points, 0.0
-    pull, bends = right.copy(), np.diff(points, 2, axis=0)
-    new = bends[1:] - stiff.memory * bends[:-1]
-    for a, change in enumerate(stiff.changes):
-        pull[a : n - 3 + a] -= stiff.price * change * new
-    for a, change in enumerate((1.0, -2.0, 1.0)):
-        pull[a] -= stiff.first * change * bends[0]
-    factor = cholesky_banded(_bands(normal, stiff))
-    move = cho_solve_banded((factor, False), pull.reshape(-1)).reshape(n, 3)
-    bends = np.diff(points + move, 2, axis=0)
-    cost = stiff.price * np.sum((bends[1:] - stiff.memory * bends[:-1]) ** 2) + stiff.first * np.sum(bends[0] ** 2)
-    misfit = np.einsum("ni,nij,nj", move, normal, move) - 2 * np.sum(right * move) + cost
-    likely = 1.5 * (n - 3) * np.log(stiff.price) + 1.5 * np.log(stiff.first or 1.0) - np.log(factor[9]).sum() - 0.5 * misfit
-    return points + move, float(likely)
+    moved, log_det, misfit = _smoothed(np.ascontiguousarray(points), normal, right, stiff.price, stiff.first, np.array(stiff.changes))
+    return moved, 1.5 * (n - 3) * np.log(stiff.price) + 1.5 * np.log(stiff.first or 1.0) - log_det - 0.5 * misfit
 
 
 def covariance(normal: np.ndarray, stiff: Stiffness) -> np.ndarray:
     """Covariance (n, 3, 3) of each point that ``smoothed`` gives for ties ``normal`` (n, 3, 3): the blocks on the diagonal of the
     inverse of its matrix. n >= 4."""
-    return diagonal_blocks(cholesky_banded(_bands(normal, stiff)))
+    return diagonal_blocks(_factored(normal, stiff.price, stiff.first, np.array(stiff.changes)))
+
+
+@njit(cache=True, nogil=True)
+def _smoothed(points, normal, right, price, first, changes):
+    """(moved points (n, 3), half the logarithm of the determinant, misfit) of ``smoothed``."""
+    n = len(points)
+    move, start = right.copy(), (1.0, -2.0, 1.0)
+    for c in range(3):
+        for t in range(n - 3):
+            new = price * _new(points, t, c, changes)
+            for a in range(4):
+                move[t + a, c] -= changes[a] * new
+        bend = first * (points[0, c] - 2 * points[1, c] + points[2, c])
+        for a in range(3):
+            move[a, c] -= start[a] * bend
+    lower = _factored(normal, price, first, changes)
+    _solve(lower, move.reshape(-1))
+    moved, misfit = points + move, 0.0
+    for c in range(3):
+        for t in range(n - 3):
+            misfit += price * _new(moved, t, c, changes) ** 2
+        misfit += first * (moved[0, c] - 2 * moved[1, c] + moved[2, c]) ** 2
+        for j in range(n):
+            held = normal[j, c, 0] * move[j, 0] + normal[j, c, 1] * move[j, 1] + normal[j, c, 2] * move[j, 2]
+            misfit += move[j, c] * (held - 2 * right[j, c])
+    return moved, np.log(lower[:, 0]).sum(), misfit
+
+
+@njit(cache=True, nogil=True)
+def _new(points, t, c, changes):
+    """What is new in the second differences of coordinate c at point t."""
+    return changes[0] * points[t, c] + changes[1] * points[t + 1, c] + changes[2] * points[t + 2, c] + changes[3] * points[t + 3, c]
+
+
+@njit(cache=True, nogil=True)
+def _factored(normal, price, first, changes):
+    """L of L Lᵀ, the matrix of ties normal (n, 3, 3) and what bends cost: lower (3 n, BAND + 1), [i, k] the element (i, i - k)."""
+    n, start = len(normal), (1.0, -2.0, 1.0)
+    lower = np.zeros((3 * n, BAND + 1))
+    for j in range(n):
+        for c in range(3):
+            for d in range(c + 1):
+                lower[3 * j + c, c - d] = normal[j, c, d]
+            lower[3 * j + c, 0] += 1e-9 + 1e-13 * price  # a hair that nothing ties is still held somewhere
+    for t in range(n - 3):
+        for a in range(4):
+            for b in range(a, 4):
+                for c in range(3):
+                    lower[3 * (t + b) + c, 3 * (b - a)] += price * changes[a] * changes[b]
+    for a in range(3):
+        for b in range(a, 3):
+            for c in range(3):
+                lower[3 * b + c, 3 * (b - a)] += first * start[a] * start[b]
+    for i in range(3 * n):
+        for k in range(min(i, BAND), -1, -1):
+            j = i - k
+            total = lower[i, k]
+            for m in range(1, min(BAND - k, j) + 1):
+                total -= lower[i, k + m] * lower[j, m]
+            lower[i, k] = total / lower[j, 0] if k else np.sqrt(total)
+    return lower
+
+
+@njit(cache=True, nogil=True)
+def _solve(lower, x):
+    """x (3 n,) replaced by the solution of L Lᵀ y = x."""
+    size = len(x)
+    for i in range(size):
+        for k in range(1, min(i, BAND) + 1):
+            x[i] -= lower[i, k] * x[i - k]
+        x[i] /= lower[i, 0]
+    for i in range(size - 1, -1, -1):
+        for k in range(1, min(size - 1 - i, BAND) + 1):
+            x[i] -= lower[i + k, k] * x[i + k]
+        x[i] /= lower[i, 0]
 
 
 def across(covariances: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -68,40 +134,22 @@ def across(covariances: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(np.trace(covariances, axis1=1, axis2=2) - along, 0.0))
 
 
-def _bands(normal: np.ndarray, stiff: Stiffness) -> np.ndarray:
-    """The matrix (10, 3 n) of ties normal (n, 3, 3) and what bends cost, upper banded."""
-    n = len(normal)
-    bands = np.zeros((10, 3 * n))
-    for c in range(3):
-        for d in range(c, 3):
-            bands[9 - (d - c), d::3] = normal[:, c, d]
-    changes, start = stiff.changes, (1.0, -2.0, 1.0)
-    for a in range(4):
-        for b in range(a, 4):
-            bands[9 - 3 * (b - a), 3 * b : 3 * (n - 3 + b)] += stiff.price * changes[a] * changes[b]
-    for a in range(3):
-        for b in range(a, 3):
-            bands[9 - 3 * (b - a), 3 * b : 3 * b + 3] += stiff.first * start[a] * start[b]
-    bands[9] += 1e-9 + 1e-13 * stiff.price  # a hair that nothing ties is still held somewhere
-    return bands
-
-
 @njit(cache=True, nogil=True)
-def diagonal_blocks(factor: np.ndarray) -> np.ndarray:
-    """The 3 x 3 blocks (n, 3, 3) on the diagonal of the inverse of a matrix A = Uᵀ U, without the rest of the inverse.
+def diagonal_blocks(lower):
+    """The 3 x 3 blocks (n, 3, 3) on the diagonal of the inverse of a matrix A = L Lᵀ, without the rest of the inverse.
 
-    factor (b + 1, 3 n): U, upper banded as ``scipy.linalg.cholesky_banded`` gives it. From the last row upwards, each row of
-    the inverse inside the band follows from those below it (Takahashi, Fagan and Chen 1973): b² operations a row, b >= 2.
+    lower (3 n, b + 1): [i, k] the element (i, i - k) of L. From the last row upwards, each row of the inverse inside the band
+    follows from those below it (Takahashi, Fagan and Chen 1973): b² operations a row, b >= 2.
     """
-    width, size = factor.shape[0] - 1, factor.shape[1]
+    size, width = len(lower), lower.shape[1] - 1
     inverse = np.zeros((size, width + 1))  # [i, k]: the element (i, i + k)
     for i in range(size - 1, -1, -1):
         last = min(width, size - 1 - i)
         for k in range(last, -1, -1):
-            total = 1.0 / factor[width, i] if k == 0 else 0.0
+            total = 1.0 / lower[i, 0] if k == 0 else 0.0
             for m in range(1, last + 1):
-                total -= factor[width - m, i + m] * (inverse[i + m, k - m] if k >= m else inverse[i + k, m - k])
-            inverse[i, k] = total / factor[width, i]
+                total -= lower[i + m, m] * (inverse[i + m, k - m] if k >= m else inverse[i + k, m - k])
+            inverse[i, k] = total / lower[i, 0]
     blocks = np.empty((size // 3, 3, 3))
     for j in range(len(blocks)):
         for c in range(3):

@@ -155,6 +155,12 @@ def _crossings(points, shown, angle_deg, d, seen):
     )
 
 
+def densely(points) -> np.ndarray:
+    """The polyline of points (n, 3), with forty points a segment."""
+    at = np.linspace(0, len(points) - 1, 40 * (len(points) - 1) + 1)
+    return np.stack([np.interp(at, np.arange(len(points)), x) for x in np.asarray(points, float).T], axis=1)
+
+
 def in_volume(points_mm, seen: Seen, at_least=3) -> np.ndarray:
     """(n,) bool: points that at least three sweeps have in their field and in their range of focus."""
     count = np.zeros(len(points_mm), int)

@@ -9,7 +9,7 @@ from strandscope.core.grow import GrowParams, Stop, box_of, claims_of, grow, sol
 from strandscope.core.look import claimed
 from strandscope.core.refine import _weigh
 
-from .known import OPTICS, Seen, helix, in_volume, line, observe, wave
+from .known import OPTICS, Seen, densely, helix, in_volume, line, observe, wave
 
 # A camera gives the mean place of the observations in a box 1.14 mm along the hair. On a hair of curvature k that mean lies
 # k 1.14^2 / 24 beside the centreline: 5 um for these helices and waves (k up to 0.10 / mm). A thousand observations of 0.2 px
@@ -35,8 +35,8 @@ def farthest(truth, points) -> float:
 
 
 def covered(truth, found, seen) -> float:
-    """Share of a curve inside the volume that has a point of ``found`` (n, 3) near it."""
-    return float((cKDTree(found).query(truth[in_volume(truth, seen)])[0] < COVERED_MM).mean())
+    """Share of a curve inside the volume that has the curve ``found`` (n, 3) near it."""
+    return float((cKDTree(densely(found)).query(truth[in_volume(truth, seen)])[0] < COVERED_MM).mean())
 
 
 def length(points) -> float:
@@ -192,7 +192,7 @@ def test_a_curve_is_no_longer_than_allowed():
     params = GrowParams(max_length_mm=3.0)
     grown = grown_from([line()], params=params)
     found = curves_of(grown)
-    assert max(map(length, found)) == pytest.approx(3.0, abs=0.11)  # a step
+    assert max(map(length, found)) == pytest.approx(3.0, abs=0.21)  # a step
     assert Stop.TOO_LONG in grown.stops
 
 

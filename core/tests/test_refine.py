@@ -9,7 +9,7 @@ from strandscope.core.grow import GrowParams, grow
 from strandscope.core.joining import Curve, bridged
 from strandscope.core.refine import RefineParams, _fit_all, _join, _uncross, _work, bend_at_large, trace
 
-from .known import OPTICS, Seen, helix, in_volume, line, observe, wave
+from .known import OPTICS, Seen, densely, helix, in_volume, line, observe, wave
 
 # An observation errs by 0.2 px in column and row, 5.7 um; some 100 of them tie each point of a curve.
 ON_CURVE_MM = 0.003
@@ -38,7 +38,7 @@ def test_a_fiber_is_one_curve_on_its_centreline(truth, seen):
     assert off.mean() < ON_CURVE_MM
     assert off.max() < 4 * ON_CURVE_MM
     inside = truth[in_volume(truth, seen)]
-    assert (distances(found[0], inside) < 0.07).mean() > 0.95
+    assert (distances(densely(found[0]), inside) < 0.07).mean() > 0.95
 
 
 def test_fits_lie_closer_than_what_was_grown():
@@ -57,7 +57,7 @@ def test_a_gap_that_no_camera_sees_is_joined_over():
         found = curves_of(traced([truth], hidden=lambda points, _sweep: np.abs(points[:, 1]) < 0.6))
         assert len(found) == 1
         inside = np.abs(found[0][:, 1]) < 0.6
-        assert inside.sum() > 8
+        assert inside.sum() >= 5
         # over a gap the curve is carried on evenly: for this wave, whose bend turns over in the gap, off by some 20 um
         assert distances(truth, found[0][inside]).max() < 0.03
 
