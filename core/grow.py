@@ -129,7 +129,7 @@ def claims_of(params: GrowParams, box: Box) -> Box:
 # ---- Figure 7 --------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def solve_direction(normals, weights, g):
     """The unit direction (3,) with normals (S, 3) . direction = 0 in the least squares, nearest in sign to g.
 
@@ -153,7 +153,7 @@ def solve_direction(normals, weights, g):
     return x if x[0] * g[0] + x[1] * g[1] + x[2] * g[2] > 0 else -x
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _within_cone(new, old, box):
     """``new`` turned back to the rim of the cone of omega around ``old`` where it lies outside (unit vectors)."""
     c = new[0] * old[0] + new[1] * old[1] + new[2] * old[2]
@@ -166,14 +166,14 @@ def _within_cone(new, old, box):
     return box.cone_cos * old + (box.cone_sin / size) * side
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _bounded(q, bound):
     """q (3,), no longer than bound."""
     size = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2)
     return q * (bound / size) if size > bound else q
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _foretell(state, evidence, filled, sign, box):
     """Where the hair will be one step on: (p, g, curvature vector), each (3,).
 
@@ -196,7 +196,7 @@ def _foretell(state, evidence, filled, sign, box):
     return p / total, g, bend - g * (g[0] * bend[0] + g[1] * bend[1] + g[2] * bend[2])
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def grow_end(index, box, view, state, evidence, filled, sign):
     """Grow on from state (n, 9), of which the first ``filled`` rows are there: points, tangents (turned by ``sign``) and
     curvatures; fills it and evidence (n,). Returns (points there are now, Stop)."""
@@ -223,7 +223,7 @@ def grow_end(index, box, view, state, evidence, filled, sign):
     return kept, Stop.TOO_LONG.value
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _snap(index, p, g, least, box, view):
     """Draw a seed onto the centreline: (evidence, p, g, curvature). It must come to rest with enough cameras, else evidence
     is less than ``least``."""
@@ -313,7 +313,7 @@ def _new_cell(cameras):
     )
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _seed_direction(index, centre, size, least, cell):
     """The direction (3,) that the mean orientations of the sweeps with unused features in a cell agree on, and how many these are;
     no direction where they are fewer than ``least``. What is in the cell is left in ``cell``."""
@@ -356,7 +356,7 @@ def _seed_direction(index, centre, size, least, cell):
     return solve_direction(cell.normals, cell.weights, unit(np.array((0.1, 1.0, 0.05)))), cameras
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _promise(index, centre, direction, gate, cell):
     """The most evidence that a hair through a cell along a direction may have: by the cameras that see something turned like it in
     the cell, and by the shares of this that no curve stands on. A tenth of the time that looking at it takes."""

@@ -67,7 +67,7 @@ class Frame(NamedTuple):
     size: float  # how long a mm of hair is in the image, mm
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def sees(index, k, u, v, w):
     """Whether the point (u', v', w) of camera k's frame comes into focus inside its photographs."""
     low, high = index.positions[index.first_position[k]], index.positions[index.first_position[k + 1] - 1]
@@ -75,7 +75,7 @@ def sees(index, k, u, v, w):
     return low <= w <= high and 0 <= col <= index.columns - 1 and 0 <= row <= index.rows - 1
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def hair_frame(index, k, p, g):
     """Camera k's Frame of a hair at p (3,) along the unit vector g (3,)."""
     pu, pv, pw = _turn(p[0], p[1], p[2], index.cos[k], index.sin[k])
@@ -91,7 +91,7 @@ def hair_frame(index, k, p, g):
     return Frame((pu, pv, pw), (gu, gv, gw), (su, sv, sw), t, np.arctan2(dv, du), np.hypot(du, dv))
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def shows(index, k, frame):
     """Whether camera k shows a hair of this Frame: it comes into focus inside a photograph, and does not point at the camera."""
     return frame.size >= LEAST_SIZE and sees(index, k, frame.p[0], frame.p[1], frame.p[2])
@@ -120,7 +120,7 @@ def new_hits(cameras):
     return Hits(told[0], told[1], told[2], told[3], told[4], told[5], told[6], number, near, inside)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def gather(index, k, frame, bend, sag, box, hits, count):
     """Observations of camera k in the box of a hair, into hits from ``count`` on; returns how many there are now.
 
@@ -153,7 +153,7 @@ def gather(index, k, frame, bend, sag, box, hits, count):
     return count
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _placed(index, k, start, size, at, along, across, depth, angle, bend, sag, limits, hits):
     """Place features start … start + size - 1 of camera k in the frame of a hair: ``hits.near`` and ``hits.inside``."""
     f32 = np.float32
@@ -195,7 +195,7 @@ def _picked(index, start, size, shared, hits, count):
     return count
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _weighted(box, hits, start, stop):
     """Give the hits start … stop - 1 their weight, and their strength its part."""
     f32 = np.float32
@@ -231,7 +231,7 @@ def new_view(cameras):
     return View(new_hits(cameras), np.zeros(cameras + 1, np.int64), np.zeros((cameras, 3)), np.zeros(cameras), np.zeros(cameras))
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def look(index, p, g, bend, box, view):
     """Gather every camera's observations of a hair at p along g that bends by the curvature vector ``bend`` (3,) 1/mm.
     Returns how many cameras could see it."""
@@ -258,7 +258,7 @@ def look(index, p, g, bend, box, view):
 # ---- the hair that fits ----------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def visible_range(view, around):
     """The evidence of the adjacent cameras that have most: a hair is seen from one range of angles, and a chance meeting of
     the ribbons of other hairs from here and there. Each camera of the range that could see the hair costs ``UNSEEN``.
@@ -274,7 +274,7 @@ def visible_range(view, around):
     return max(best, total - worst)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _moments(hits, start, stop, o0, o1, o2, narrow):
     """Sums over the observations start … stop - 1 of one camera, each by its weight and how near it lies to the line
     o0 + a (o1 + a o2 / 2): of a^0 … a^4, across a^0 … a^2, minus turn a^0 and a^1, what is left of across, and its square."""
@@ -307,7 +307,7 @@ def _moments(hits, start, stop, o0, o1, o2, narrow):
     return f64(s0), f64(s1), f64(s2), f64(s3), f64(s4), f64(r0), f64(r1), f64(r2), f64(l0), f64(l1), f64(rest), f64(rest2)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _depth_of(hits, start, stop, o0, o1, o2, narrow, deepest):
     """Strength of the observations start … stop - 1 of one camera near the line, that of those no other curve has, and this times depth."""
     f32 = np.float32
@@ -327,7 +327,7 @@ def _depth_of(hits, start, stop, o0, o1, o2, narrow, deepest):
     return np.float64(whole), np.float64(free), np.float64(deep)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def fit(view, around, g, box, wide, prior):
     """The bent line that the observations of ``view`` support: (cameras that agree, evidence, place, direction, curvature).
 
@@ -394,7 +394,7 @@ def fit(view, around, g, box, wide, prior):
     return spoke, visible_range(view, around), theta[0] * ax + theta[1] * ay, theta[2] * ax + theta[3] * ay, theta[4] * ax + theta[5] * ay
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def perpendicular(g):
     """Two unit vectors (3,) that make a right-handed frame with the unit vector g."""
     x = np.zeros(3)
@@ -404,7 +404,7 @@ def perpendicular(g):
     return x, np.cross(g, x)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _cholesky_solve(m, b, x):
     """Solve m x = b for a symmetric positive definite m (n, n), which is overwritten."""
     n = len(b)
@@ -426,13 +426,13 @@ def _cholesky_solve(m, b, x):
         x[i] = s / m[i, i]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def unit(g):
     """g (3,), 1 long."""
     return g / np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def chord(points, j):
     """Unit direction (3,) of a curve of points (n, 3) at point j."""
     return unit(points[min(j + 1, len(points) - 1)] - points[max(j - 1, 0)])
@@ -441,7 +441,7 @@ def chord(points, j):
 # ---- what a curve stands on ------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def claimed(index, points, box):
     """Numbers (n,) int32 of the observations that a curve of points (m, 3) stands on, used up or not."""
     hits, count = new_hits(1), 0

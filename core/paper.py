@@ -121,7 +121,7 @@ def _box(params: PaperParams, index: Index) -> _Box:
 # ---- observations near a point of a hair -----------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _sees(index, k, u, v, w):
     """Whether the point (u, v, w) of camera k's frame comes into focus inside its photographs."""
     positions = index.positions[index.first_position[k] : index.first_position[k + 1]]
@@ -129,7 +129,7 @@ def _sees(index, k, u, v, w):
     return positions[0] <= w <= positions[-1] and 0 <= col <= index.columns - 1 and 0 <= row <= index.rows - 1
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _axes(index, k, p, g):
     """A point p (3,) and the axes g, s, t of its box in camera k's frame, as rows of (4, 3): s is the slope of the ribbon
     made perpendicular to g, t the normal of both."""
@@ -143,7 +143,7 @@ def _axes(index, k, p, g):
     return axes
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _in_box(index, k, axes, half, gate_cos, take):
     """Camera k's observations in a box: (number, sum of their places across in mm, sums of cos and sin of twice their
     angles). With ``take`` they are deleted. Bound by cache misses: a few dozen runs of 8-byte features."""
@@ -182,7 +182,7 @@ def _in_box(index, k, axes, half, gate_cos, take):
     return count, offset, re, im
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _normal(index, k, u, v, re, im):
     """Unit normal (3,), object frame, of the plane through camera k and the line through its image point (u, v) that has the
     mean orientation given by the sums of cos and sin of twice the angle (n_k of "direction estimation")."""
@@ -197,7 +197,7 @@ def _normal(index, k, u, v, re, im):
 # ---- Figure 7 --------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def find_orientations(index, p, g, box, normals):
     """Fill normals (m, 3) with the planes in which the cameras that have p (3,) near focus see the hair lie, g (3,) being
     its direction so far. Returns (m, cameras that have the point in their field)."""
@@ -223,7 +223,7 @@ def solve_direction(normals, g):
     return x if np.sum(x * g) >= 0 else -x
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def solve_correction(index, p, g, box):
     """The offset (3,) perpendicular to g that moves p to the common middle of the ribbons: eq. 3, a row t_k . q = t_k . (x_i - p)
     for each observation x_i in the boxes. Zero where the cameras that have any do not tell."""
@@ -248,7 +248,7 @@ def solve_correction(index, p, g, box):
     return x * ((bb * at - ab * bt) / det) + y * ((aa * bt - ab * at) / det)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _within_cone(new, old, box):
     """``new`` turned back to the rim of the cone of omega around ``old`` where it lies outside (unit vectors)."""
     c = np.sum(new * old)
@@ -258,7 +258,7 @@ def _within_cone(new, old, box):
     return box.cone_cos * old + (box.cone_sin / (np.sqrt(np.sum(side**2)) + 1e-12)) * side
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _shortened(q, bound):
     """q (3,), no longer than bound."""
     size = np.sqrt(np.sum(q**2))

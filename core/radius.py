@@ -31,7 +31,7 @@ class RadiusParams:
     fiber: tuple[float, float] = (0.13, 0.6)  # error of one fiber, and of one step of it, beside that
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _tally(index, k, breadth, points, box, tally):
     """Add the breadths of what sweep k sees of a curve (n, 3) to tally (BREADTHS,), each by its weight and strength squared."""
     hits = new_hits(1)

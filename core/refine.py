@@ -81,7 +81,7 @@ class Seen(NamedTuple):
     thin: np.ndarray  # (n, S) square of how long a mm of hair is in the image
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _seen(index, points, box):
     """What the cameras see (Seen) of a curve of points (n, 3). A move of less than what the weights reach needs no new look."""
     n, cameras = len(points), len(index.cos)
@@ -106,7 +106,7 @@ def _seen(index, points, box):
     return Seen(across[:count].copy(), weight[:count].copy(), ends, ribbon, thin)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _tie(seen, points, move, box, normal, right):
     """What the cameras say of each point (n, 3), moved by ``move`` (n, 3) since they were asked: the sums normal (n, 3, 3) and
     right (n, 3) of its least squares, in cameras that see it fully. The place of an observation is that of the hair's image
@@ -224,7 +224,7 @@ def bend_at_large(curves: Iterable[tuple[np.ndarray, np.ndarray]], step_mm: floa
     return max(float(np.sqrt(bends[seen >= np.median(seen)].mean())), STRAIGHT) if len(bends) else np.inf
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _weigh(index, points, box, evidence):
     """Evidence (n,) of each point (n, 3) of a curve that is already where it should be."""
     n = len(points)
@@ -247,7 +247,7 @@ def _weigh(index, points, box, evidence):
 # ---- growing on ------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True)
 def _grow_on(index, points, box, state, evidence):
     """Grow on from the last of points (n, 3); fills state (m, 9) and evidence (m,), which begin with the points' own last
     ones. Returns (rows of the points', rows there are, Stop)."""
