@@ -1,14 +1,18 @@
-"""Photographs on disk -> linear channel planes, through LibRaw, and raw files out of mosaics.
+"""Photographs on disk -> linear channel planes, and raw files out of mosaics.
 
 A channel plane is one colour of the Bayer mosaic at half resolution (sec. 4.1: no demosaicing), float32, black level
 subtracted, 1.0 at white level. An RGB file (EXR, TIFF) gives its planes at full resolution.
+
+LibRaw reads the cameras' raw files. A DNG of a usual layout is read by ``dng``, several times as fast, once the first file of its
+kind has been read both ways and found the same.
 """
 
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +25,7 @@ RAW_SUFFIXES = {
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".iiq", ".kdc", ".mef", ".mos", ".mrw", ".nef", ".nrw"),
     *(".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
 }
+_ROWS_AT_ONCE = 32  # of a plane, while it is made: they stay in the cache
 CAMERA_NAME = "Virtual macro camera"
 # Of the virtual camera: XYZ (D65) -> R, G, B, and its response to a neutral. They matter to raw developers only.
 _COLOR_MATRIX = (2.4967, -1.0463, -0.3736, -0.4291, 1.3896, 0.0811, -0.0643, 0.1044, 0.7407)
@@ -141,7 +146,12 @@ def _bayer_planes(mosaic, pattern, blacks, white, channels, path) -> np.ndarray:
         sites = [i for i, letter in enumerate(pattern) if letter == channel]
         for site in sites:
             cell = mosaic[site // 2 : 2 * height : 2, site % 2 : 2 * width : 2]
-            plane += (cell.astype(np.float32) - np.float32(blacks[site])) / np.float32(len(sites) * (white - blacks[site]))
+            black, span = np.float32(blacks[site]), np.float32(len(sites) * (white - blacks[site]))
+            for row in range(0, height, _ROWS_AT_ONCE):
+                part = cell[row : row + _ROWS_AT_ONCE].astype(np.float32)
+                part -= black
+                part /= span
+                plane[row : row + _ROWS_AT_ONCE] += part
     return planes
 
 
@@ -181,16 +191,86 @@ def _linear_planes(path: Path, channels: str) -> np.ndarray:
 
 
 def _raw_planes(path: Path, channels: str) -> np.ndarray:
+    if path.suffix.lower() == ".dng":
+        from . import dng  # and with it numba, which takes a third of a second
+
+        try:
+            data = np.fromfile(path, np.uint8)
+            layout = dng.read_layout(data)
+            sensor = None if _ever_new_kinds() else _verified(_Kind(layout.signature, path))
+            if sensor is not None:
+                return sensor.planes(sensor.visible(dng.read_mosaic(data, layout)), channels, path)
+        except (dng.Unsupported, OSError):  # LibRaw may understand it, or says what is wrong
+            pass
+    with _by_libraw(path) as (visible, sensor):
+        return sensor.planes(visible, channels, path)
+
+
+@dataclass(frozen=True)
+class _Sensor:
+    """What LibRaw makes of a file's tags: where in its mosaic the visible one lies, and what the numbers there mean."""
+
+    pattern: str
+    blacks: tuple[int, ...]  # of the four sites of a cell, row by row
+    white: int
+    top: int
+    left: int
+    height: int
+    width: int
+    mosaic_shape: tuple[int, int]
+
+    def visible(self, mosaic: np.ndarray) -> np.ndarray:
+        return mosaic[self.top : self.top + self.height, self.left : self.left + self.width]
+
+    def planes(self, visible: np.ndarray, channels: str, path: Path) -> np.ndarray:
+        return _bayer_planes(visible, self.pattern, self.blacks, self.white, channels, path)
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """Files with the same tags, and one of them."""
+
+    signature: bytes
+    path: Path = field(compare=False)
+
+
+@lru_cache(maxsize=64)
+def _verified(kind: _Kind) -> _Sensor | None:
+    """What LibRaw says of the first file of a kind, if it also finds the very numbers that ``dng`` does; else None, for all of them."""
+    from . import dng
+
+    with _by_libraw(kind.path) as (visible, sensor):
+        try:
+            data = np.fromfile(kind.path, np.uint8)
+            mosaic = dng.read_mosaic(data, dng.read_layout(data))
+        except dng.Unsupported:
+            return None
+        same = mosaic.shape == sensor.mosaic_shape and np.array_equal(sensor.visible(mosaic), visible)
+        return sensor if same else None
+
+
+def _ever_new_kinds() -> bool:
+    """Whether it does not pay to verify kinds, since files have turned out to be of another one each time."""
+    found = _verified.cache_info()
+    return found.misses > 16 + found.hits
+
+
+@contextmanager
+def _by_libraw(path: Path) -> Iterator[tuple[np.ndarray, _Sensor]]:
+    """The visible mosaic of a raw file, which goes when this ends, and what LibRaw says of it. Raises CaptureError."""
     import rawpy
 
     try:
         with _quiet_stderr(), rawpy.imread(str(path)) as raw:
             if raw.raw_pattern is None or raw.raw_pattern.shape != (2, 2):
                 raise CaptureError(f"{path}: has no 2x2 Bayer pattern (a linear or demosaiced raw); expected a camera's own raw file")
-            names = raw.color_desc.decode("ascii", "replace")
-            sites = raw.raw_pattern.ravel()
-            blacks = [raw.black_level_per_channel[i] for i in sites]
-            return _bayer_planes(raw.raw_image_visible, "".join(names[i] for i in sites), blacks, raw.white_level, channels, path)
+            names, sites, size = raw.color_desc.decode("ascii", "replace"), raw.raw_pattern.ravel(), raw.sizes
+            blacks = tuple(raw.black_level_per_channel[i] for i in sites)
+            place = (size.top_margin, size.left_margin, size.height, size.width)
+            yield (
+                raw.raw_image_visible,
+                _Sensor("".join(names[i] for i in sites), blacks, raw.white_level, *place, (size.raw_height, size.raw_width)),
+            )
     except (rawpy.LibRawError, OSError, ValueError) as error:
         raise CaptureError(f"{path}: LibRaw cannot read this photograph, it may be cut short or damaged ({_one_line(error)})") from error
 
