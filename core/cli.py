@@ -22,6 +22,7 @@ from .files import atomic, explain
 PATH = click.Path(path_type=Path)
 POSITIVE = click.FloatRange(min=0, min_open=True)
 PRESETS = ("auto", "straight", "wavy", "curls")
+STAGES = ("ridges", "decode", "growing", "directions", "index")  # of bench
 FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
 
 
@@ -599,6 +600,35 @@ def accuracy(session, folder, styles, fibers, methods, scale, seed, captures, jo
     session.report.show(harness.table(rows))
     for written in harness.save(folder, rows):
         session.report.done(written)
+
+
+@main_group.command(short_help="Time the stages beside what one would use otherwise.")
+@click.option("--stages", type=Words(choices=STAGES), default=",".join(STAGES), show_default=True, help="Stages to time.")
+@click.option("--json", "json_file", type=PATH, help="Write all times, the ratios and the machine to this file too.")
+@click.option("--plot", type=PATH, help="Draw the ratios (.png).")
+@click.option("--rounds", type=click.IntRange(3), default=9, show_default=True, help="How often each is timed; less if it takes long.")
+@common
+@click.pass_obj
+def bench(session, stages, json_file, plot, rounds):
+    """Time the stages of a reconstruction beside what one would use otherwise, and compare the answers.
+
+    OpenCV's filters and scikit-image's, LibRaw, scipy's cKDTree with numpy, scipy's conjugate gradients. They take turns on the
+    same input, on one thread each; the result is how many times longer the others take, and how near ours is to what the
+    machine can do. Takes some minutes and 1.3 GB of memory. Ends with an error if the answers differ.
+
+    \b
+    Example:
+      strandscope bench --json out/bench.json --plot out/bench.png
+      strandscope bench --stages ridges,decode
+    """
+    from . import bench as benchmark
+
+    report = benchmark.bench(benchmark.BenchParams(stages=stages, rounds=rounds), session.report)
+    if plot:
+        benchmark.plot(report, plot)
+        session.report.done(plot)
+    _hand_over(session, report, terminal.table(benchmark.describe(report)), json_file)
+    benchmark.expect_same(report)
 
 
 def _hand_over(session: Session, numbers: dict, text: str, json_file: Path | None) -> None:
