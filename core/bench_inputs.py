@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from .features import Index, SweepFeatures, build_index, pack
 from .geometry import Optics, turn
-from .infill import KNOWN, OUTSIDE, UNKNOWN
+from .laplace import KNOWN, OUTSIDE, UNKNOWN
 from .raw import write_dng
 from .ridges import Ridges
 from .simulate import BLACK, WHITE, SimulateParams, expose
@@ -52,7 +52,7 @@ class BenchParams:
     columns: int = 2193
     ring: RingParams = RingParams()  # of cameras, for growing and the index
     grid: tuple[int, int, int] = (128, 128, 128)  # of cells, for the directions
-    cycles: int = 6  # V-cycles of ours
+    cycles: int = 5  # V-cycles of ours: to what single precision can tell of the other's, too
     seed: int = 0
 
 

@@ -13,7 +13,7 @@ from strandscope.core.bench import bench, describe, expect_same, named_ratios, p
 from strandscope.core.bench_clock import Check, Contest, Least, Rates, Way, machine_rates, measure
 from strandscope.core.bench_inputs import STAGES, BenchParams, RingParams, lossless_jpeg, write_lossless_dng
 from strandscope.core.errors import StrandscopeError
-from strandscope.core.infill import KNOWN, UNKNOWN, laplace_fill
+from strandscope.core.laplace import KNOWN, UNKNOWN, laplace_fill
 from strandscope.core.terminal import table
 
 TINY = BenchParams(rounds=3, seconds=0.0, rows=150, columns=180, ring=RingParams(6, 90, 1.0, 5), grid=(20, 18, 16))

@@ -5,23 +5,10 @@ from itertools import pairwise
 import numba
 import numpy as np
 import pytest
-import scipy.sparse
-import scipy.sparse.linalg
 
 from strandscope.core.errors import StrandscopeError
 from strandscope.core.hull import Grid
-from strandscope.core.infill import (
-    KNOWN,
-    OUTSIDE,
-    UNKNOWN,
-    InfillParams,
-    captured_density,
-    curve_signs,
-    direction_field,
-    infill,
-    laplace_fill,
-    missing_density,
-)
+from strandscope.core.infill import InfillParams, captured_density, curve_signs, direction_field, infill, missing_density
 
 GRID = Grid.around((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0), 0.25)
 EVERYWHERE = np.ones(GRID.shape, np.float32)
@@ -55,62 +42,6 @@ def helices(pitch_mm=6.0):
 def reverse_some(points, offsets, seed=0):
     rng = np.random.default_rng(seed)
     return np.concatenate([points[a:b][:: rng.choice([-1, 1])] for a, b in pairwise(offsets)])
-
-
-# ---- Laplace's equation ----------------------------------------------------------------------------------------------
-
-
-def solved_plainly(values, kinds):
-    """Oracle: one sparse linear system a component, solved directly."""
-    number = np.full(kinds.shape, -1)
-    unknown = np.argwhere(kinds == UNKNOWN)
-    number[tuple(unknown.T)] = np.arange(len(unknown))
-    matrix, right = scipy.sparse.lil_matrix((len(unknown), len(unknown))), np.zeros((len(unknown), values.shape[-1]))
-    for row, cell in enumerate(unknown):
-        for step in np.concatenate([np.eye(3, dtype=int), -np.eye(3, dtype=int)]):
-            other = tuple(cell + step)
-            if min(other) < 0 or any(np.array(other) >= kinds.shape) or kinds[other] == OUTSIDE:
-                continue
-            matrix[row, row] += 1
-            if kinds[other] == UNKNOWN:
-                matrix[row, number[other]] -= 1
-            else:
-                right[row] += values[other]
-    out = values.astype(float).copy()
-    solve = scipy.sparse.linalg.factorized(matrix.tocsc())
-    out[kinds == UNKNOWN] = np.stack([solve(right[:, c]) for c in range(values.shape[-1])], axis=1)
-    return out
-
-
-def test_linear_field_is_reproduced():
-    shape = (33, 20, 27)
-    field = np.stack(np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij"), axis=-1).astype(np.float32)
-    kinds = np.full(shape, KNOWN, np.uint8)
-    kinds[1:-1, 1:-1, 1:-1] = UNKNOWN
-    holes = np.where(kinds[..., None] == KNOWN, field, np.float32(7.0))  # what stands in unknown cells must not matter
-    assert np.abs(laplace_fill(holes, kinds, cycles=40, tolerance=1e-6) - field).max() < 1e-4
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_solution_is_that_of_the_plain_solver(seed):
-    rng = np.random.default_rng(seed)
-    shape = (19, 22, 17)  # odd sizes, more than one level
-    kinds = np.where(rng.random(shape) < 0.01, KNOWN, UNKNOWN).astype(np.uint8)
-    kinds[: rng.integers(3, 7), 10:] = OUTSIDE
-    kinds[9:11, 9:, 3:9] = OUTSIDE  # a wall in the midst
-    values = rng.normal(size=(*shape, 2)).astype(np.float32)
-    solved = laplace_fill(values, kinds, cycles=40, tolerance=1e-6)
-    assert np.array_equal(solved[kinds == KNOWN], values[kinds == KNOWN])
-    assert np.abs(solved - solved_plainly(values, kinds))[kinds == UNKNOWN].max() < 1e-3
-
-
-def test_few_cycles_are_enough_for_directions():
-    kinds = np.full((40, 40, 40), UNKNOWN, np.uint8)
-    kinds[[0, -1]] = KNOWN
-    values = np.zeros((40, 40, 40, 1), np.float32)
-    values[-1] = 1.0
-    exact = np.linspace(0, 1, 40)[:, None, None, None]
-    assert np.abs(laplace_fill(values, kinds) - exact).max() < 0.01
 
 
 # ---- directions ------------------------------------------------------------------------------------------------------
