@@ -16,6 +16,8 @@ from .geometry import slope, to_image, to_pixel, turn, turn_back
 _turn, _turn_back, _slope, _to_pixel, _to_image = njit(turn), njit(turn_back), njit(slope), njit(to_pixel), njit(to_image)
 CHUNK = 256  # features that are looked at together
 MAX_HITS = 1024  # observations that one camera has of a place
+LANES = 16  # sums that are added up side by side
+SETTLED = 0.1  # of sigma: a fit that moves by no more is the last but one
 PLACE_PX, ANGLE_RAD = 0.22, 0.0436  # errors of one observation across the hair and of its angle (2.5 degrees)
 TWIST_RAD = 0.0698  # a camera that sees the hair turned by more than this (4 degrees) is no evidence for it
 SHARE_POWER = 0.1  # of the share of its observations that a camera has: many that see a little tell more than one that sees all
@@ -108,16 +110,15 @@ class Hits(NamedTuple):
     strength: np.ndarray  # weighted by turn
     free: np.ndarray  # 1, or less where another curve has used it up
     number: np.ndarray  # int32, in the index
-    near: np.ndarray  # (5 CHUNK,) of the features that are looked at: along, across, turn, depth, position
-    inside: np.ndarray  # (CHUNK,) uint8: whether they are in the box
+    near: np.ndarray  # (5 CHUNK,) of the features that are looked at: along, across, turn, depth, and first the position, then whether inside
 
 
 @njit(cache=True, nogil=True)
 def new_hits(cameras):
     """Room for the observations of so many cameras."""
-    told = np.empty((7, cameras * MAX_HITS), np.float32)
-    number, near, inside = np.empty(cameras * MAX_HITS, np.int32), np.empty(5 * CHUNK, np.float32), np.empty(CHUNK, np.uint8)
-    return Hits(told[0], told[1], told[2], told[3], told[4], told[5], told[6], number, near, inside)
+    told = np.empty((7, cameras * MAX_HITS + LANES), np.float32)
+    number, near = np.empty(cameras * MAX_HITS, np.int32), np.empty(5 * CHUNK, np.float32)
+    return Hits(told[0], told[1], told[2], told[3], told[4], told[5], told[6], number, near)
 
 
 @njit(cache=True, nogil=True)
@@ -138,60 +139,60 @@ def gather(index, k, frame, bend, sag, box, hits, count):
     col, row = index.pitch / COL_STEPS, -index.pitch / ROW_STEPS
     along, across, depth = (gu * col, gv * row, gw), (tu * col, tv * row, tw), (su * col, sv * row, sw)
     limits = half[0], half[2], box.deep, GATE * box.sigma_angle
+    positions = index.positions_f32[index.first_position[k] : index.first_position[k + 1]]
+    stored, found = (index.col, index.row, index.frame, index.angle, index.strength), (hits.along, hits.across, hits.turn, hits.depth)
     for strip in range(s0, s1):
         for block in range(b0, b1):
             start, stop = run_of(index, k, strip, block, first_frame, last_frame)
+            if start == stop:
+                continue
             x, y = _to_image(float(strip * STRIP_PX), float(block * BLOCK_PX), index.pitch, index.axis_col, index.axis_row)
             x, y = x - pu, y - pv
             at = gu * x + gv * y - gw * pw, tu * x + tv * y - tw * pw, su * x + sv * y - sw * pw
-            while start < stop:
-                size = min(stop - start, CHUNK)
-                _placed(index, k, start, size, at, along, across, depth, frame.angle, bend, sag, limits, hits)
-                count = _picked(index, start, size, box.shared, hits, count)
-                start += size
+            placing = at, along, across, depth, frame.angle, bend, sag, limits
+            count = _taken(stored, start, stop, positions, placing, box.shared, hits.near, found, hits.strength, hits.free, hits.number, count)
     _weighted(box, hits, before, count)
     return count
 
 
 @njit(cache=True, nogil=True)
-def _placed(index, k, start, size, at, along, across, depth, angle, bend, sag, limits, hits):
-    """Place features start … start + size - 1 of camera k in the frame of a hair: ``hits.near`` and ``hits.inside``."""
-    f32 = np.float32
-    cols, rows, frames = index.col[start : start + size], index.row[start : start + size], index.frame[start : start + size]
-    angles, positions = index.angle[start : start + size], index.positions_f32[index.first_position[k] : index.first_position[k + 1]]
-    near, inside = hits.near, hits.inside
-    for i in range(size):  # alone, since a look into a table keeps a loop from being done by vectors
-        near[i + 4 * CHUNK] = positions[frames[i]]
-    a_at, t_at, d_at = f32(at[0]), f32(at[1]), f32(at[2])
+def _taken(stored, start, stop, positions, placing, shared, near, found, h_strength, h_free, h_number, count):
+    """Place features start … stop - 1 of a camera in the frame of a hair, and take those in the box; returns how many hits there are now.
+
+    It is given the arrays that it needs and no more: a call takes as long as its arguments are many, and a run has some hundred features.
+    """
+    f32, size = np.float32, np.uint64(CHUNK)
+    (cols, rows, frames, angles, levels), (h_along, h_across, h_turn, h_depth) = stored, found
+    (a_at, t_at, d_at), along, across, depth, angle, bend, sag, limits = placing
+    a_at, t_at, d_at = f32(a_at), f32(t_at), f32(d_at)
     a_col, a_row, a_pos = f32(along[0]), f32(along[1]), f32(along[2])
     t_col, t_row, t_pos = f32(across[0]), f32(across[1]), f32(across[2])
     d_col, d_row, d_pos = f32(depth[0]), f32(depth[1]), f32(depth[2])
     bent, half_bent, half_sagged = f32(bend), f32(0.5 * bend), f32(0.5 * sag)
     unit, turned, over, pi, half_turn = f32(np.pi / ANGLE_STEPS), f32(angle), f32(1 / np.pi), f32(np.pi), f32(0.5)
     long, wide, deep, gate = f32(limits[0]), f32(limits[1]), f32(limits[2]), f32(limits[3])
-    for i in range(size):
-        c, r, p = f32(cols[i]), f32(rows[i]), near[i + 4 * CHUNK]
-        a = a_at + a_col * c + a_row * r + a_pos * p
-        t = t_at + t_col * c + t_row * r + t_pos * p - half_bent * a * a
-        d = d_at + d_col * c + d_row * r + d_pos * p - half_sagged * a * a
-        # s looks at the camera and t = g x s, so a hair that turns counterclockwise in the image leans away from t
-        off = f32(angles[i]) * unit - turned + bent * a
-        off -= pi * np.floor(off * over + half_turn)
-        near[i], near[i + CHUNK], near[i + 2 * CHUNK], near[i + 3 * CHUNK] = a, t, off, d
-        inside[i] = (abs(a) <= long) & (abs(t) <= wide) & (abs(d) <= deep) & (abs(off) <= gate)
-
-
-@njit(cache=True, nogil=True)
-def _picked(index, start, size, shared, hits, count):
-    """Take what is inside out of ``hits.near``; returns how many hits there are now."""
-    near, inside = hits.near, hits.inside
-    for i in range(size):
-        if inside[i] and count < len(hits.number):
-            level = index.strength[start + i]
-            hits.along[count], hits.across[count] = near[i], near[i + CHUNK]
-            hits.turn[count], hits.depth[count] = near[i + 2 * CHUNK], near[i + 3 * CHUNK]
-            hits.strength[count], hits.free[count], hits.number[count] = strength_of(level), shared if level >= USED else 1.0, start + i
-            count += 1
+    first, end = np.uint64(start), np.uint64(stop)
+    while first < end:
+        many = min(end - first, size)
+        for i in range(many):  # alone, since a look into a table keeps a loop from being done by vectors
+            near[i + 4 * size] = positions[np.uint64(frames[first + i])]
+        for i in range(many):
+            c, r, p = f32(cols[first + i]), f32(rows[first + i]), near[i + 4 * size]
+            a = a_at + a_col * c + a_row * r + a_pos * p
+            t = t_at + t_col * c + t_row * r + t_pos * p - half_bent * a * a
+            d = d_at + d_col * c + d_row * r + d_pos * p - half_sagged * a * a
+            # s looks at the camera and t = g x s, so a hair that turns counterclockwise in the image leans away from t
+            off = f32(angles[first + i]) * unit - turned + bent * a
+            off -= pi * np.floor(off * over + half_turn)
+            near[i], near[i + size], near[i + 2 * size], near[i + 3 * size] = a, t, off, d
+            near[i + 4 * size] = f32(1) if (abs(a) <= long) & (abs(t) <= wide) & (abs(d) <= deep) & (abs(off) <= gate) else f32(0)
+        for i in range(many):
+            if near[i + 4 * size] > 0 and count < len(h_number):
+                level = levels[first + i]
+                h_along[count], h_across[count], h_turn[count], h_depth[count] = near[i], near[i + size], near[i + 2 * size], near[i + 3 * size]
+                h_strength[count], h_free[count], h_number[count] = strength_of(level), shared if level >= USED else 1.0, first + i
+                count += 1
+        first += many
     return count
 
 
@@ -213,6 +214,8 @@ def _weighted(box, hits, start, stop):
         z = z if abs(depths[i]) <= middle else none
         weights[i] = y * y * z * z * frees[i]
         strengths[i] = y * y * strengths[i]
+    for i in range(stop, stop + LANES):  # ``_moments`` reads on
+        hits.along[i] = hits.across[i] = hits.turn[i] = hits.weight[i] = none
 
 
 class View(NamedTuple):
@@ -275,36 +278,47 @@ def visible_range(view, around):
 
 
 @njit(cache=True, nogil=True)
-def _moments(hits, start, stop, o0, o1, o2, narrow):
-    """Sums over the observations start … stop - 1 of one camera, each by its weight and how near it lies to the line
-    o0 + a (o1 + a o2 / 2): of a^0 … a^4, across a^0 … a^2, minus turn a^0 and a^1, what is left of across, and its square."""
-    f32 = np.float32
-    alongs, offs, turns, weights = hits.along[start:stop], hits.across[start:stop], hits.turn[start:stop], hits.weight[start:stop]
+def _moments(hits, start, stop, o0, o1, o2, narrow, sums):
+    """Fill sums (12 LANES,) with sums over the observations start … stop - 1 of one camera, each by its weight and how near it lies to
+    the line o0 + a (o1 + a o2 / 2): of a^0 … a^4, across a^0 … a^2, minus turn a^0 and a^1, what is left of across, and its square.
+
+    Added up in LANES, since a compiler may not change the order of a sum by itself; the first of each twelve lanes is all of it then.
+    """
+    f32, n = np.float32, LANES
+    alongs, offs, turns, weights, end = hits.along, hits.across, hits.turn, hits.weight, np.uint64(stop)
     o0, o1, o2, narrow, bow, one, none = f32(o0), f32(o1), f32(0.5 * o2), f32(narrow), f32(BOW), f32(1), f32(0)
-    s0 = s1 = s2 = s3 = s4 = r0 = r1 = r2 = l0 = l1 = rest = rest2 = none
-    for i in range(len(alongs)):
-        a, across, off = alongs[i], offs[i], turns[i]
-        left = across - (o0 + a * (o1 + a * o2))
-        x = left * narrow
-        x = max(one - bow * x * x, none)
-        w = weights[i] * x * x
-        wa = w * a
-        waa = wa * a
-        waaa = waa * a
-        s0 += w
-        s1 += wa
-        s2 += waa
-        s3 += waaa
-        s4 += waaa * a
-        rest += w * left
-        rest2 += w * left * left
-        r0 += w * across
-        r1 += wa * across
-        r2 += waa * across
-        l0 -= w * off
-        l1 -= wa * off
-    f64 = np.float64
-    return f64(s0), f64(s1), f64(s2), f64(s3), f64(s4), f64(r0), f64(r1), f64(r2), f64(l0), f64(l1), f64(rest), f64(rest2)
+    sums[:] = none
+    for first in range(np.uint64(start), end, np.uint64(n)):
+        left_over = f32(end - first)
+        for i in range(n):
+            a, across, off = alongs[first + i], offs[first + i], turns[first + i]
+            left = across - (o0 + a * (o1 + a * o2))
+            x = left * narrow
+            x = max(one - bow * x * x, none)
+            w = weights[first + i] * x * x * (one if f32(i) < left_over else none)  # a choice of numbers is made by vectors
+            wa = w * a
+            waa = wa * a
+            waaa = waa * a
+            rest = w * left
+            sums[i] += w
+            sums[n + i] += wa
+            sums[2 * n + i] += waa
+            sums[3 * n + i] += waaa
+            sums[4 * n + i] += waaa * a
+            sums[5 * n + i] += w * across
+            sums[6 * n + i] += wa * across
+            sums[7 * n + i] += waa * across
+            sums[8 * n + i] -= w * off
+            sums[9 * n + i] -= wa * off
+            sums[10 * n + i] += rest
+            sums[11 * n + i] += rest * left
+    for c in range(12):
+        o = c * n
+        for i in range(n // 2):
+            sums[o + i] += sums[o + n // 2 + i]
+        for i in range(n // 4):
+            sums[o + i] += sums[o + n // 4 + i]
+        sums[o] = (sums[o] + sums[o + 1]) + (sums[o + 2] + sums[o + 3])
 
 
 @njit(cache=True, nogil=True)
@@ -333,17 +347,18 @@ def fit(view, around, g, box, wide, prior):
 
     The last three are vectors (3,) perpendicular to g by which the hair differs from the one looked for: at the way ``a``
     along g it lies at place + direction a + curvature a^2 / 2. Weighted least squares over the offsets and the angles of all
-    observations at once (eq. 3 made longer), three times: each observation counts less the farther it lies from the hair of
-    the time before, and so does a camera as a whole. ``wide`` is the width of that weight in sigma; ``prior`` holds place,
+    observations at once (eq. 3 made longer), three times at most: each observation counts less the farther it lies from the hair
+    of the time before, and so does a camera as a whole. ``wide`` is the width of that weight in sigma; ``prior`` holds place,
     direction and curvature to what was looked for.
     """
-    cameras = len(view.told)
+    cameras, n, f64 = len(view.told), LANES, np.float64
     ax, ay = perpendicular(g)
-    theta = np.zeros(6)
+    theta, before, sums = np.zeros(6), np.zeros(6), np.empty(12 * LANES, np.float32)
     m, b = np.empty((6, 6)), np.empty(6)
     lever = (PLACE_PX * box.pixel / ANGLE_RAD) ** 2
-    spoke = 0
+    spoke, last = 0, False
     for trial in range(4):
+        last |= trial == 3
         m[:] = 0.0
         b[:] = 0.0
         for c in range(6):
@@ -358,7 +373,10 @@ def fit(view, around, g, box, wide, prior):
             t = view.across[k]
             tx, ty = t[0] * ax[0] + t[1] * ax[1] + t[2] * ax[2], t[0] * ay[0] + t[1] * ay[1] + t[2] * ay[2]
             o0, o1, o2 = theta[0] * tx + theta[1] * ty, theta[2] * tx + theta[3] * ty, theta[4] * tx + theta[5] * ty
-            s0, s1, s2, s3, s4, r0, r1, r2, l0, l1, rest, rest2 = _moments(view.hits, view.ends[k], view.ends[k + 1], o0, o1, o2, narrow)
+            _moments(view.hits, view.ends[k], view.ends[k + 1], o0, o1, o2, narrow, sums)
+            s0, s1, s2, s3, s4 = f64(sums[0]), f64(sums[n]), f64(sums[2 * n]), f64(sums[3 * n]), f64(sums[4 * n])
+            r0, r1, r2, l0, l1 = f64(sums[5 * n]), f64(sums[6 * n]), f64(sums[7 * n]), f64(sums[8 * n]), f64(sums[9 * n])
+            rest, rest2 = f64(sums[10 * n]), f64(sums[11 * n])
             share = s0 / view.full[k]
             if share < box.min_support:
                 continue
@@ -368,7 +386,7 @@ def fit(view, around, g, box, wide, prior):
                 continue
             twist = (o1 + (o2 * s1 - l0) / s0) / TWIST_RAD
             spoke += 1
-            if trial == 3:
+            if last:
                 spread = np.sqrt(max(rest2 / s0 - (rest / s0) ** 2, 0.0)) / (wide * box.pixel)
                 sharp = min(max(1 - (spread - SPREAD_PX[0]) / SPREAD_PX[1], 0.1), 1.2)
                 whole, free, deep = _depth_of(view.hits, view.ends[k], view.ends[k + 1], o0, o1, o2, narrow, deepest)
@@ -388,10 +406,23 @@ def fit(view, around, g, box, wide, prior):
                     m[2 * c + 1, 2 * d + 1] += agree * e * ty * ty
                 b[2 * c] += agree * right[c] * tx
                 b[2 * c + 1] += agree * right[c] * ty
-        if spoke == 0 or trial == 3:
+        if spoke == 0 or last:
             break
+        before[:] = theta
         _cholesky_solve(m, b, theta)
+        before -= theta
+        last = _far(before, box.half[0]) < SETTLED * wide * box.sigma
     return spoke, visible_range(view, around), theta[0] * ax + theta[1] * ay, theta[2] * ax + theta[3] * ay, theta[4] * ax + theta[5] * ay
+
+
+@njit(cache=True, nogil=True)
+def _far(theta, reach):
+    """How far apart two lines of which the ``theta`` differ by (6,) may be, within ``reach`` to either side."""
+    x, y = (
+        abs(theta[0]) + reach * (abs(theta[2]) + 0.5 * reach * abs(theta[4])),
+        abs(theta[1]) + reach * (abs(theta[3]) + 0.5 * reach * abs(theta[5])),
+    )
+    return np.hypot(x, y)
 
 
 @njit(cache=True, nogil=True)
