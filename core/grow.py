@@ -26,7 +26,7 @@ from numba import njit
 
 from .features import ANGLE_STEPS, BLOCK_PX, COL_STEPS, ROW_STEPS, STRIP_PX, USED, Index, cell_range, frames_between, image_of, run_of
 from .geometry import slope, to_image, turn, turn_back
-from .look import GATE, LEAST_SIZE, PLACE_PX, Box, claimed, fit, hair_frame, look, new_view, unit
+from .look import GATE, LEAST_SIZE, PLACE_PX, UNSEEN, Box, claimed, fit, hair_frame, look, new_view, perpendicular, unit
 from .progress import Progress, silent
 from .stops import Stop
 
@@ -36,11 +36,16 @@ IN_CELL = 256  # observations of a camera in a cell that are looked at
 SEEN_AT_ALL = 3  # observations of a camera in a seed's cell
 H_MM = 0.1  # h of Table 1, for which omega and gamma are told
 RECORDED, SEEN_BY = 3, 4  # features by which a sweep records a cell, and sweeps that must
-PROMISED = (0.66, 0.71)  # evidence of a seed for each camera that sees something like it, and for each of their shares; 3 in 100 have more
+PROMISED = (0.66, 0.71, 0.7)  # evidence of a seed for each camera that sees something like it, for each of their shares, and for each camera
+# that meets others; 3 in 100 have more
+MET, OF_PX, MET_WITHIN = 11, 3, 2  # squares each way in which cameras meet, a pixel wide; parts of a pixel that offsets are told in; and how many
+# of these a ribbon may be off
+SEEN_TOGETHER, LEAST_MET = 2, 2.5  # features of a camera that meets others, and cameras that must
 PHASES = 8  # groups of layers of cells in which seeds are tried
 FAR_FIRST = (0, 4, 2, 6, 1, 5, 3, 7)  # the order of the groups
 RASTERED = 4  # parts in which layers are counted
 BATCH = 64  # seeds grown against the same observations; part of the result, not of the machine
+AT_REST = 0.1  # of gamma: a seed that is drawn by no more has come to rest
 DEEP, FOCUS = 2.3, 0.5  # of sigma_focus: how far along a ribbon a camera's depth is looked for, and how well it must agree
 OBSERVED_TOGETHER = 17.0  # observations of one camera in a step that err alike: rows and frames that see the same
 
@@ -243,6 +248,8 @@ def _snap(index, p, g, least, box, view):
         moved = np.sqrt(np.sum(place**2))
         if np.sqrt(np.sum((p - start) ** 2)) > 3 * box.half[2]:
             return 0.0, p, g, bend
+        if trial > 1 and moved < AT_REST * box.gamma:
+            break
     return evidence if moved < 2 * box.gamma else 0.0, p, g, bend
 
 
@@ -296,20 +303,26 @@ class _Cell(NamedTuple):
     """What S sweeps have in a cell of the grid: room for it."""
 
     angles: np.ndarray  # (S, IN_CELL) uint8
+    places: np.ndarray  # (S, IN_CELL, 3) float32: from the middle of the cell, mm in the camera's (u, v, d)
     free: np.ndarray  # (S, IN_CELL) uint8: whether no curve stands on it
     count: np.ndarray  # (S,) int64
     normals: np.ndarray  # (S, 3)
     weights: np.ndarray  # (S,)
+    meeting: np.ndarray  # (MET, MET) uint32: the sweeps, a bit each, with ribbons of unused features through each square across a hair
+    passed: np.ndarray  # (3 MET OF_PX,) uint8: how many of one sweep's lie at each offset across its ribbons
 
 
 @njit(cache=True, nogil=True)
 def _new_cell(cameras):
     return _Cell(
         np.empty((cameras, IN_CELL), np.uint8),
+        np.empty((cameras, IN_CELL, 3), np.float32),
         np.empty((cameras, IN_CELL), np.uint8),
         np.zeros(cameras, np.int64),
         np.zeros((cameras, 3)),
         np.zeros(cameras),
+        np.zeros((MET, MET), np.uint32),
+        np.zeros(3 * MET * OF_PX, np.uint8),
     )
 
 
@@ -337,6 +350,9 @@ def _seed_direction(index, centre, size, least, cell):
                         angle, free = index.angle[i], index.strength[i] < USED
                         if count < IN_CELL:
                             cell.angles[k, count], cell.free[k, count] = angle, free
+                            cell.places[k, count, 0] = x + unit_col * index.col[i] - u0
+                            cell.places[k, count, 1] = y - unit_row * index.row[i] - v0
+                            cell.places[k, count, 2] = index.positions[index.first_position[k] + index.frame[i]] - w0
                             count += 1
                         if free:
                             re += _DOUBLE_COS[angle]
@@ -359,24 +375,78 @@ def _seed_direction(index, centre, size, least, cell):
 @njit(cache=True, nogil=True)
 def _promise(index, centre, direction, gate, cell):
     """The most evidence that a hair through a cell along a direction may have: by the cameras that see something turned like it in
-    the cell, and by the shares of this that no curve stands on. A tenth of the time that looking at it takes."""
+    the cell, by the shares of this that no curve stands on, and by how many of these meet in one place. A tenth of the time that
+    looking at it takes."""
     agreeing = shares = 0.0
+    ax, ay = perpendicular(direction)
+    cell.meeting[:] = 0
     for k in range(len(index.cos)):
         if cell.count[k] == 0:
             continue
         frame = hair_frame(index, k, centre, direction)
         if frame.size < LEAST_SIZE:
             continue
+        tx, ty, tz = _turn_back(frame.t[0], frame.t[1], frame.t[2], index.cos[k], index.sin[k])
+        cell.passed[:] = 0
         free = there = 0
         for i in range(cell.count[k]):
             off = cell.angles[k, i] * (np.pi / ANGLE_STEPS) - frame.angle
             off -= np.pi * np.floor(off * (1 / np.pi) + 0.5)
-            here = abs(off) <= gate
-            there += here
-            free += here & cell.free[k, i]
+            if abs(off) > gate:
+                continue
+            there += 1
+            if cell.free[k, i]:
+                free += 1
+                place = cell.places[k, i]
+                across = (frame.t[0] * place[0] + frame.t[1] * place[1] + frame.t[2] * place[2]) / index.pitch
+                _pass(cell.passed, across)
         agreeing += free >= SEEN_AT_ALL
         shares += free / max(there, 1)
-    return min(agreeing * PROMISED[0], shares * PROMISED[1])
+        if free >= SEEN_TOGETHER:
+            _meet(cell.meeting, cell.passed, k, tx * ax[0] + ty * ax[1] + tz * ax[2], tx * ay[0] + ty * ay[1] + tz * ay[2])
+    most = min(agreeing * PROMISED[0], shares * PROMISED[1])
+    met = _most_met(cell.meeting, index.around) if most > 0 else 0.0
+    return min(most, met * PROMISED[2]) if met >= LEAST_MET else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _pass(passed, across):
+    """Count a ribbon of one sweep that passes by ``across`` pixels, and as it may be off."""
+    at = len(passed) // 2 + int(np.floor(across * OF_PX + 0.5))
+    for i in range(max(at - MET_WITHIN, 0), min(at + MET_WITHIN + 1, len(passed))):
+        passed[i] += 1
+
+
+@njit(cache=True, nogil=True)
+def _meet(meeting, passed, k, tx, ty):
+    """Enter sweep k, whose ribbons are perpendicular to (tx, ty), in the squares across the hair, a pixel each, that they pass."""
+    bit, middle = np.uint32(1) << np.uint32(k), MET // 2
+    for a in range(MET):
+        for b in range(MET):
+            at = len(passed) // 2 + int(np.floor(((a - middle) * tx + (b - middle) * ty) * OF_PX + 0.5))
+            if passed[at] >= SEEN_TOGETHER:
+                meeting[a, b] |= bit
+
+
+@njit(cache=True, nogil=True)
+def _most_met(meeting, around):
+    """The most cameras of one range of adjacent ones that meet in a square, less UNSEEN for each other one in the range."""
+    best = 0.0
+    for a in range(MET):
+        for b in range(MET):
+            sweeps = meeting[a, b]
+            if sweeps == 0:
+                continue
+            total = run = most = lull = worst = 0.0
+            for k in around:
+                worth = 1.0 if (sweeps >> np.uint32(k)) & np.uint32(1) else -UNSEEN
+                total += worth
+                run = max(run + worth, 0.0)
+                most = max(most, run)
+                lull = min(lull + worth, 0.0)
+                worst = min(worst, lull)
+            best = max(best, most, total - worst)
+    return best
 
 
 @njit(cache=True, nogil=True)
