@@ -385,9 +385,10 @@ def import_(
 @click.option("--no-infill", is_flag=True, help="Captured hairs only.")
 @click.option("--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given.")
 @click.option("--memory", type=Memory(), default="6GB", show_default=True, help="Memory to use at most; a capture that needs more is refused.")
+@click.option("--scheduler", metavar="tcp://HOST:PORT", help="Work on the Dask cluster of this scheduler, too.")
 @common
 @click.pass_obj
-def reconstruct(session, capture, output, preset, params, method, calibration, infill, no_infill, workers, memory):
+def reconstruct(session, capture, output, preset, params, method, calibration, infill, no_infill, workers, memory, scheduler):
     """Find the hairs in the photographs of CAPTURE and write them as curves to a strands file.
 
     CAPTURE is a folder with capture.json in it (`strandscope import` makes one from photographs). What a run needs to
@@ -406,7 +407,7 @@ def reconstruct(session, capture, output, preset, params, method, calibration, i
         parameters = replace(parameters, infill=None)
     elif infill is not None:
         parameters = replace(parameters, infill=replace(parameters.infill, count=infill))
-    limits = {"workers": workers, "memory_bytes": memory, "progress": session.report}
+    limits = {"workers": workers, "memory_bytes": memory, "progress": session.report, "scheduler": scheduler, "tell": session.report.note}
     strands = pipeline.reconstruct(capture, output, parameters, calibration=calibration, **limits)
     captured = len(strands.captured)
     session.report.show(f"{output}: {captured} captured curves, {len(strands) - captured} of infill")
@@ -420,9 +421,10 @@ def reconstruct(session, capture, output, preset, params, method, calibration, i
 @click.option("--params", type=PATH, help="A TOML file with settings of the filter and of growing.")
 @click.option("--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given.")
 @click.option("--memory", type=Memory(), default="6GB", show_default=True, help="Memory to use at most; a capture that needs more is refused.")
+@click.option("--scheduler", metavar="tcp://HOST:PORT", help="Find the ridges on the Dask cluster of this scheduler.")
 @common
 @click.pass_obj
-def calibrate(session, capture, output, params, workers, memory):
+def calibrate(session, capture, output, params, workers, memory, scheduler):
     """Find by how much the rig that took CAPTURE is not as its capture.json says.
 
     Looks for the place and the tilt of the turntable's axis, the focus, the working distance, the angle of each sweep, and the
@@ -438,7 +440,8 @@ def calibrate(session, capture, output, params, workers, memory):
     from .rig.calibrate import describe
 
     parameters = pipeline.read_toml(params) if params else pipeline.preset()
-    found = pipeline.calibrate(capture, output, parameters, workers=workers, memory_bytes=memory, progress=session.report)
+    limits = {"workers": workers, "memory_bytes": memory, "progress": session.report, "scheduler": scheduler, "tell": session.report.note}
+    found = pipeline.calibrate(capture, output, parameters, **limits)
     session.report.show(terminal.table(describe(found)))
     session.report.done(output)
 
