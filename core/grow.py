@@ -513,7 +513,7 @@ def grow(
                     told = notes.earlier()
                     if told is None:
                         told = _grow_batches(crew, seeds.centres(cells[first : first + ahead * BATCH]), least, params, box, claims)
-                        ahead = 1 if told[1] else min(2 * ahead, crew.ahead)
+                        ahead = -(-len(told[0]) // BATCH) if told[1] else min(2 * ahead, crew.ahead)
                         notes.add(*told)
                     found.append(told[0])
                     curves += told[1]
