@@ -362,32 +362,45 @@ def import_(
         session.report.done(importer.carry_out(plan, copy=copy, progress=session.report))
 
 
+def _of_reconstructing(command):
+    """Add the options of a reconstruction."""
+    for option in reversed((
+        click.option("--preset", type=click.Choice(PRESETS), default="auto", show_default=True,
+                     help="The paper's settings for a kind of hair; auto estimates them from the photographs."),
+        click.option("--params", type=PATH, help="A TOML file with settings, in place of a preset."),
+        click.option("--method", type=click.Choice(["strandscope", "paper"]), default="strandscope", show_default=True,
+                     help="The paper's own filter and growing, or ours, which finds more."),
+        click.option("--calibration", type=PATH, help="What is wrong with the rig, from `strandscope calibrate`; it is corrected."),
+        click.option("--infill", type=click.IntRange(0), metavar="N", help="Number of hairs to add inside, where no camera sees."),
+        click.option("--no-infill", is_flag=True, help="Captured hairs only."),
+        click.option("--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given."),
+        click.option("--memory", type=Memory(), default="6GB", show_default=True,
+                     help="Memory to use at most; a capture that needs more is refused."),
+        click.option("--scheduler", metavar="tcp://HOST:PORT", help="Work on the Dask cluster of this scheduler, too (docs/cluster.md)."),
+    )):  # fmt: skip
+        command = option(command)
+    return command
+
+
+def _parameters(preset, params, method, infill, no_infill):
+    """The parameters that the options of a reconstruction ask for."""
+    if infill is not None and no_infill:
+        raise click.UsageError("--infill and --no-infill exclude each other")
+    from . import pipeline
+
+    parameters = pipeline.read_toml(params) if params else pipeline.preset(preset, method)
+    if no_infill:
+        return replace(parameters, infill=None)
+    return parameters if infill is None else replace(parameters, infill=replace(parameters.infill or pipeline.InfillParams(), count=infill))
+
+
 @main_group.command(short_help="Find the hairs in a capture, write them as curves.")
 @click.argument("capture", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, help="The strands file to write (.npz).")
-@click.option(
-    "--preset",
-    type=click.Choice(PRESETS),
-    default="auto",
-    show_default=True,
-    help="The paper's settings for a kind of hair; auto estimates them from the photographs.",
-)
-@click.option("--params", type=PATH, help="A TOML file with settings, in place of a preset.")
-@click.option(
-    "--method",
-    type=click.Choice(["strandscope", "paper"]),
-    default="strandscope",
-    show_default=True,
-    help="The paper's own filter and growing, or ours, which finds more.",
-)
-@click.option("--calibration", type=PATH, help="What is wrong with the rig, from `strandscope calibrate`; it is corrected.")
-@click.option("--infill", type=click.IntRange(0), metavar="N", help="Number of hairs to add inside, where no camera sees.")
-@click.option("--no-infill", is_flag=True, help="Captured hairs only.")
-@click.option("--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given.")
-@click.option("--memory", type=Memory(), default="6GB", show_default=True, help="Memory to use at most; a capture that needs more is refused.")
+@_of_reconstructing
 @common
 @click.pass_obj
-def reconstruct(session, capture, output, preset, params, method, calibration, infill, no_infill, workers, memory):
+def reconstruct(session, capture, output, preset, params, method, calibration, infill, no_infill, workers, memory, scheduler):
     """Find the hairs in the photographs of CAPTURE and write them as curves to a strands file.
 
     CAPTURE is a folder with capture.json in it (`strandscope import` makes one from photographs). What a run needs to
@@ -397,20 +410,50 @@ def reconstruct(session, capture, output, preset, params, method, calibration, i
     Example:
       strandscope reconstruct lock -o out/strands.npz --preset straight --no-infill
     """
-    if infill is not None and no_infill:
-        raise click.UsageError("--infill and --no-infill exclude each other")
     from . import pipeline
 
-    parameters = pipeline.read_toml(params) if params else pipeline.preset(preset, method)
-    if no_infill:
-        parameters = replace(parameters, infill=None)
-    elif infill is not None:
-        parameters = replace(parameters, infill=replace(parameters.infill, count=infill))
-    limits = {"workers": workers, "memory_bytes": memory, "progress": session.report}
+    parameters = _parameters(preset, params, method, infill, no_infill)
+    limits = {"workers": workers, "memory_bytes": memory, "progress": session.report, "scheduler": scheduler, "tell": session.report.note}
     strands = pipeline.reconstruct(capture, output, parameters, calibration=calibration, **limits)
     captured = len(strands.captured)
     session.report.show(f"{output}: {captured} captured curves, {len(strands) - captured} of infill")
     session.report.done(output)
+
+
+@main_group.command(short_help="Reconstruct many captures, one after the other.")
+@click.argument("captures", metavar="CAPTURE...", type=PATH, nargs=-1)
+@click.option("-o", "--output", "folder", type=PATH, required=True, metavar="FOLDER", help="The folder for the strands files, one a capture.")
+@click.option("--list", "listed", type=PATH, metavar="FILE", help="A text file with more captures, one a line.")
+@click.option("--json", "json_file", type=PATH, help="Write what became of each capture to this file too.")
+@_of_reconstructing
+@common
+@click.pass_obj
+def batch(session, captures, folder, listed, json_file, preset, params, method, calibration, infill, no_infill, workers, memory, scheduler):
+    """Find the hairs in each CAPTURE and write them to FOLDER, as <name of the capture>.npz.
+
+    Captures that are done are left alone: those whose photographs and settings are the same as when their file in FOLDER was
+    made. After one that fails it goes on with the next. At the end a table tells what became of each; the exit code is 1 if
+    one failed. Run the same command again to go on after an interruption.
+
+    \b
+    Example:
+      strandscope batch locks/* -o out --no-infill
+      strandscope batch --list captures.txt -o out --json out/outcomes.json
+    """
+    from . import batch as many
+
+    captures = [*captures, *(many.read_list(listed) if listed else [])]
+    if not captures:
+        raise click.UsageError("there is no CAPTURE, and --list has none; expected one or more")
+    parameters, report = _parameters(preset, params, method, infill, no_infill), session.report
+    limits = {"workers": workers, "memory_bytes": memory, "scheduler": scheduler}
+    outcomes = list(many.batch(captures, folder, parameters, calibration=calibration, progress=report, tell=report.note, **limits))
+    _hand_over(session, many.report(outcomes), many.table(outcomes), json_file)
+    for outcome in outcomes:
+        if not outcome.error:
+            report.done(outcome.output)
+    if failed := sum(bool(outcome.error) for outcome in outcomes):
+        raise StrandscopeError(f"{failed} of {len(outcomes)} captures failed")
 
 
 @main_group.command(short_help="Find what is wrong with the rig, from a capture.")
@@ -420,9 +463,10 @@ def reconstruct(session, capture, output, preset, params, method, calibration, i
 @click.option("--params", type=PATH, help="A TOML file with settings of the filter and of growing.")
 @click.option("--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given.")
 @click.option("--memory", type=Memory(), default="6GB", show_default=True, help="Memory to use at most; a capture that needs more is refused.")
+@click.option("--scheduler", metavar="tcp://HOST:PORT", help="Find the ridges on the Dask cluster of this scheduler.")
 @common
 @click.pass_obj
-def calibrate(session, capture, output, params, workers, memory):
+def calibrate(session, capture, output, params, workers, memory, scheduler):
     """Find by how much the rig that took CAPTURE is not as its capture.json says.
 
     Looks for the place and the tilt of the turntable's axis, the focus, the working distance, the angle of each sweep, and the
@@ -438,7 +482,8 @@ def calibrate(session, capture, output, params, workers, memory):
     from .rig.calibrate import describe
 
     parameters = pipeline.read_toml(params) if params else pipeline.preset()
-    found = pipeline.calibrate(capture, output, parameters, workers=workers, memory_bytes=memory, progress=session.report)
+    limits = {"workers": workers, "memory_bytes": memory, "progress": session.report, "scheduler": scheduler, "tell": session.report.note}
+    found = pipeline.calibrate(capture, output, parameters, **limits)
     session.report.show(terminal.table(describe(found)))
     session.report.done(output)
 

@@ -36,7 +36,7 @@ class ErrorParams:
 def spread(index: Index, points: np.ndarray, grow_params: GrowParams, params: RefineParams, bend: float = np.inf) -> np.ndarray:
     """Standard deviation (n,) mm across the hair of each point (n, 3), n >= 4, of a curve that was fitted to the
     observations, at the stiffness that these make likeliest in hair of a curvature of ``bend`` (1/mm) at large."""
-    normal, _, stiff = ties(index, points, _work(index, params, grow_params, map).slab, params, bend)
+    normal, _, stiff = ties(index, points, _work(index, params, grow_params).slab, params, bend)
     return across(covariance(normal, stiff), points)
 
 

@@ -18,14 +18,18 @@ was taken by one before; what is refused is tried again in the next pass. The re
 """
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from .crew import Threads
 from .features import ANGLE_STEPS, BLOCK_PX, COL_STEPS, ROW_STEPS, STRIP_PX, USED, Index, cell_range, frames_between, image_of, run_of
 from .geometry import slope, to_image, turn, turn_back
+from .journal import Unwritten
 from .look import GATE, LEAST_SIZE, PLACE_PX, UNSEEN, Box, claimed, fit, hair_frame, look, new_view, perpendicular, unit
 from .progress import Progress, silent
 from .stops import Stop
@@ -45,6 +49,7 @@ PHASES = 8  # groups of layers of cells in which seeds are tried
 FAR_FIRST = (0, 4, 2, 6, 1, 5, 3, 7)  # the order of the groups
 RASTERED = 4  # parts in which layers are counted
 BATCH = 64  # seeds grown against the same observations; part of the result, not of the machine
+PART = 8  # of them that are grown together
 AT_REST = 0.1  # of gamma: a seed that is drawn by no more has come to rest
 DEEP, FOCUS = 2.3, 0.5  # of sigma_focus: how far along a ribbon a camera's depth is looked for, and how well it must agree
 OBSERVED_TOGETHER = 17.0  # observations of one camera in a step that err alike: rows and frames that see the same
@@ -545,49 +550,133 @@ def find_seeds(index: Index, params: GrowParams) -> Seeds:
 # ---- the whole -------------------------------------------------------------------------------------------------------
 
 
-def grow(index: Index, params: GrowParams, workers: int = 1, progress: Progress = silent, seeds: Seeds | None = None) -> Grown:
-    """Every fiber that the observations support, on ``workers`` threads. Uses up ``index.strength``.
+def grow(
+    index: Index,
+    params: GrowParams,
+    workers: int = 1,
+    progress: Progress = silent,
+    seeds: Seeds | None = None,
+    crew: Threads | None = None,
+    journal: Unwritten | None = None,
+) -> Grown:
+    """Every fiber that the observations support, on ``workers`` threads or by a ``crew``. Uses up ``index.strength``.
 
     seeds: where to begin; what is found there lowers their bound, so that growing again looks at the rest. None: all there are.
+    journal: what an earlier run found, and where to note what is found now.
 
     Deterministic: the same index and parameters give the same curves in the same order, whatever the number of threads.
     """
     box = box_of(params, index)
     claims = claims_of(params, box)
     seeds = seeds or find_seeds(index, params)
-    store = _BatchStore.of(BATCH, 2 * min(box.max_points, _longest(index, params)) + 1)
     curves: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     tried, steps = 0, len(params.seed_evidence) * PHASES
-    with ThreadPoolExecutor(workers) as pool:
+    with Threads(index, workers) if crew is None else nullcontext(crew) as crew:
+        notes = _Notes(journal or Unwritten(), crew, claims)
         for number, share in enumerate(params.seed_evidence):
             least = max(share * params.min_evidence, 1e-6)
             for step, phase in enumerate(FAR_FIRST):
-                cells, found = seeds.promising(pool, index, phase, least), []
-                for first in range(0, len(cells), BATCH):
+                cells = notes.cells(lambda phase=phase, least=least: seeds.promising(crew.pool, index, phase, least))
+                found, first, ahead = [], 0, 1
+                while first < len(cells):
                     progress("growing", number * PHASES + step + first / len(cells), steps)
-                    centres = seeds.centres(cells[first : first + BATCH])
-                    found.append(_grow_batch(pool, index, centres, least, params, box, store))
-                    curves += _accept(pool, index, store, len(centres), params.mean_share * least, params, claims)
+                    told = notes.earlier()
+                    if told is None:
+                        told = _grow_batches(crew, seeds.centres(cells[first : first + ahead * BATCH]), least, params, box, claims)
+                        ahead = -(-len(told[0]) // BATCH) if told[1] else min(2 * ahead, crew.ahead)
+                        notes.add(*told)
+                    found.append(told[0])
+                    curves += told[1]
+                    first += len(told[0])
+                notes.write()
                 seeds.tell(phase, cells, np.concatenate([*found, np.zeros(0)]))
                 tried += len(cells)
     progress("growing", steps, steps)
     return _flat(curves, tried)
 
 
-def _grow_batch(pool: ThreadPoolExecutor, index: Index, seeds: np.ndarray, least: float, params: GrowParams, box: Box, store: "_BatchStore"):
-    """Grow the seeds (b, 3) of a batch into ``store``; returns their evidence (b,)."""
+class _Notes:
+    """What is told to a journal while growing, and taken from it where an earlier run came as far: the cells of each phase, then the
+    evidence of its seeds and the curves that were accepted, some batches a record. Observations are marked as used up once
+    something is to be looked at."""
 
-    def work(part: slice) -> None:
-        _grow_seeds(index, seeds[part], params.seed_cell_mm, least, box, *store.part(part))
+    def __init__(self, journal: Unwritten, crew: Threads, claims: Box):
+        self.journal, self.crew, self.claims = journal, crew, claims
+        self.unmarked: list[np.ndarray] = []  # points (n, 3) of curves of the earlier run
+        self.found: list[np.ndarray] = []
+        self.curves: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
-    _in_parts(pool, 8, len(seeds), work)
-    return store.strength[: len(seeds)].copy()
+    def cells(self, tell) -> np.ndarray:
+        """tell(), or what it was."""
+        told = self.journal.next("cells")
+        if told is None:
+            self._mark()
+            cells = tell()
+            self.journal.write("cells", cells=cells)
+            return cells
+        return told["cells"]
+
+    def earlier(self):
+        """The evidence (n,) of some of the next seeds and the curves accepted from them, as an earlier run found them, or None."""
+        told = self.journal.next("batches")
+        if told is None:
+            self._mark()
+            return None
+        offsets = np.concatenate([[0], np.cumsum(told["sizes"])])
+        points, evidence = ([told[name][a:b] for a, b in pairwise(offsets)] for name in ("points", "evidence"))
+        self.unmarked += points
+        return told["found"], list(zip(points, evidence, told["stops"], strict=True))
+
+    def add(self, found: np.ndarray, curves: list) -> None:
+        """Note what came of some batches; it is written now and then."""
+        self.found.append(found)
+        self.curves += curves
+        if self.journal.due:
+            self.write()
+
+    def write(self) -> None:
+        """Write what was noted."""
+        if self.found:
+            flat = _flat(self.curves, 0)
+            points = np.concatenate([np.zeros((0, 3)), *(points for points, _, _ in self.curves)])
+            sizes = np.diff(flat.offsets)
+            self.journal.write("batches", found=np.concatenate(self.found), points=points, sizes=sizes, evidence=flat.evidence, stops=flat.stops)
+        self.found, self.curves = [], []
+
+    def _mark(self) -> None:
+        for numbers in self.crew.each(claim, self.unmarked, self.claims):
+            self.crew.use(numbers)
+        self.unmarked = []
 
 
-def _in_parts(pool: ThreadPoolExecutor, size: int, count: int, work) -> None:
-    """Call work(slice) for slices of ``size`` that cover range(count); the kernels let go of the interpreter's lock."""
-    for _ in pool.map(work, [slice(i, min(i + size, count)) for i in range(0, count, size)]):
-        pass
+def _grow_batches(crew: Threads, seeds: np.ndarray, least: float, params: GrowParams, box: Box, claims: Box):
+    """Grow seeds (n, 3), some batches of them, against the same observations: the evidence (m,) of those up to the end of the first
+    batch that changes what is used up, and the curves that were accepted from it."""
+    parts = [seeds[i : i + PART] for i in range(0, len(seeds), PART)]
+    grown = crew.each(_grow_part, parts, least, params, box, claims, _longest(crew.index, params))
+    found, accepted = [], []
+    for first in range(0, len(parts), BATCH // PART):
+        batch = grown[first : first + BATCH // PART]
+        found += [strength for strength, _ in batch]
+        accepted = _accept(crew, [curve for _, curves in batch for curve in curves], params)
+        if accepted:
+            break
+    return np.concatenate(found), accepted
+
+
+def _grow_part(index: Index, seeds: np.ndarray, least: float, params: GrowParams, box: Box, claims: Box, longest: int):
+    """The evidence (b,) of seeds (b, 3), and of each curve from them that is long enough and has evidence: points (n, 3), evidence
+    (n,), stops (2,), and the numbers of the observations that it stands on."""
+    store = _BatchStore.of(len(seeds), 2 * min(box.max_points, longest) + 1)
+    _grow_seeds(index, seeds, params.seed_cell_mm, least, box, store.state, store.evidence, store.begin, store.end, store.stops, store.strength)
+    long = np.flatnonzero((store.end - store.begin - 1) * params.step_mm >= params.min_length_mm)
+    curves = [curve for curve in map(store.curve, long) if curve[1].mean() >= params.mean_share * least]
+    return store.strength, [(*curve, claimed(index, curve[0], claims)) for curve in curves]
+
+
+def claim(index: Index, points: np.ndarray, claims: Box) -> np.ndarray:
+    """Numbers (m,) of the observations that a curve of points (n, 3) stands on."""
+    return claimed(index, np.ascontiguousarray(points), claims)
 
 
 def _longest(index: Index, params: GrowParams) -> int:
@@ -597,7 +686,7 @@ def _longest(index: Index, params: GrowParams) -> int:
 
 @dataclass(frozen=True)
 class _BatchStore:
-    """Room for the curves of a batch, made once."""
+    """Room for the curves of some seeds."""
 
     state: np.ndarray
     evidence: np.ndarray
@@ -611,27 +700,21 @@ class _BatchStore:
         counts = [np.zeros(seeds, np.int64) for _ in range(2)]
         return cls(np.empty((seeds, points, 9)), np.empty((seeds, points), np.float32), *counts, np.zeros((seeds, 2), np.uint8), np.zeros(seeds))
 
-    def part(self, s: slice):
-        return self.state[s], self.evidence[s], self.begin[s], self.end[s], self.stops[s], self.strength[s]
-
     def curve(self, b: int):
         """Copies of the points, the evidence and the stops of curve b."""
         row = slice(self.begin[b], self.end[b])
         return self.state[b, row, :3].copy(), self.evidence[b, row].copy(), self.stops[b].copy()
 
 
-def _accept(pool, index, store: _BatchStore, count: int, least: float, params: GrowParams, claims: Box):
-    """The curves of a batch that are long enough, have evidence and stand on observations of their own; most evidence first. What
-    they stand on is used up (REMOVE-FEATURES)."""
-    long = [b for b in range(count) if (store.end[b] - store.begin[b] - 1) * params.step_mm >= params.min_length_mm]
-    curves = [curve for curve in map(store.curve, long) if curve[1].mean() >= least]
-    curves = sorted(curves, key=lambda curve: -float(curve[1].sum()))
+def _accept(crew: Threads, curves: list, params: GrowParams) -> list:
+    """The curves of a batch that stand on observations of their own; most evidence first. What they stand on is used up
+    (REMOVE-FEATURES)."""
     accepted = []
-    for curve, numbers in zip(curves, pool.map(lambda curve: claimed(index, curve[0], claims), curves), strict=True):
-        there = np.count_nonzero(index.strength[numbers] < USED)
+    for *curve, numbers in sorted(curves, key=lambda curve: -float(curve[1].sum())):
+        there = np.count_nonzero(crew.index.strength[numbers] < USED)
         if there > 0 and there >= params.min_own * len(numbers):
-            index.strength[numbers] |= USED
-            accepted.append(curve)
+            crew.use(numbers)
+            accepted.append(tuple(curve))
     return accepted
 
 

@@ -9,23 +9,26 @@ import multiprocessing
 import os
 import threading
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from .capture import Capture, features_path, load_capture
+from .cluster import Cluster, Hands, unheard
 from .confidence import confidence, expected_error
+from .crew import Threads
 from .errors import CaptureError, StrandscopeError
-from .features import RECORDS, SweepFeatures, build_index, load_features, pack, save_features, seen_by, unpack, upright
+from .features import RECORDS, Index, SweepFeatures, build_index, load_features, pack, save_features, seen_by, unpack, upright
 from .files import atomic
 from .geometry import Optics
 from .grow import Grown, GrowParams, grow
 from .hull import Grid, HullParams, blueness, carve, grid_of, occupancy, visual_hull
 from .infill import InfillParams, infill
+from .journal import Journal, Unwritten
 from .match import Reach, sides_of, sightings
 from .paper import PaperParams, grow_paper
 from .progress import Progress, silent
@@ -53,7 +56,7 @@ from .strands import CAPTURED, INFILL, Strands, concatenate, save_strands
 VERSION = "0.1.0"
 WORKING_ROOM = 600_000_000  # bytes: the program itself, seed cells, a batch of curves
 SAMPLED_PHOTOGRAPHS = 24  # that ``estimate`` looks at
-STAMP = "made-from.txt"  # in the work folder
+STAMP, JOURNAL, USED_UP = "made-from.txt", "growing.journal", "growing.used"  # in the work folder
 # Table 1: c in 12-bit numbers with the black level (128) in it, omega in degrees, gamma in px, boxes in px
 _TABLE_1 = {"straight": (-140, 1.5, 0.5, (40.0, 30.0, 8.0)), "wavy": (-90, 1.5, 0.5, (60.0, 30.0, 8.0)), "curls": (-70, 1.5, 0.5, (60.0, 30.0, 8.0))}
 
@@ -94,52 +97,73 @@ def reconstruct(
     workers: int = 1,
     memory_bytes: int = 6 * 10**9,
     progress: Progress = silent,
+    scheduler: str | None = None,
+    tell: Callable[[str], None] = unheard,
 ) -> Strands:
     """Reconstruct a capture and write its strands to ``out`` (.npz); returns them.
 
-    The errors of the rig that a ``calibration`` file tells are corrected.
+    The errors of the rig that a ``calibration`` file tells are corrected. With the address of a Dask ``scheduler``, photographs and
+    growing are done on its cluster, and ``workers`` do the rest here; ``tell`` is called with a line where that has to wait.
 
-    The same capture and parameters give the same bytes for any number of workers. Raises CaptureError for a capture that
-    cannot be read, StrandscopeError where nothing was found or written, or more than ``memory_bytes`` would be needed.
+    The same capture and parameters give the same bytes for any number of workers, here or there, and after any interruption. Raises
+    CaptureError for a capture that cannot be read, StrandscopeError where nothing was found or written, or more than ``memory_bytes``
+    would be needed.
     """
-    capture = load_capture(capture_path)
+    capture = load_capture(capture_path if scheduler is None else Path(capture_path).resolve())
     if calibration is not None:
         capture = load_errors(calibration).corrected(capture)
     parameters = resolve(capture, parameters)
     capture = capture.reduced(parameters.ridges.reduce)
     work = work_folder(capture, Path(out), parameters)
-    sweeps = find_features(capture, work, parameters, workers, progress)
-    _check_memory(sweeps, memory_bytes)
-    index = build_index(sweeps, capture.optics)
-    if parameters.paper is not None:
-        grown, error = grow_paper(index, parameters.paper, progress), None
-        radius = np.full(len(grown.points_mm), parameters.paper.radius_mm, np.float32)
-    else:
-        grown = trace(index, parameters.grow, parameters.refine, workers, progress)
-        error = expected_error(index, parameters.grow, parameters.refine, grown.points_mm, grown.offsets, grown.evidence, workers)
-        radius = measured(index, sweeps, grown.points_mm, grown.offsets, parameters.grow, parameters.refine, parameters.radius, workers)
-    if len(grown.offsets) < 2:
-        raise StrandscopeError(
-            f"{capture.folder}: no fiber was found in {sum(map(len, sweeps))} features; expected hairs in focus in the photographs"
-        )
-    provenance = {"capture": capture.name, "version": VERSION, "parameters": asdict(parameters)}
-    strands = captured_strands(grown, error, radius, provenance)
-    if parameters.infill is not None:
-        strands = concatenate([strands, infill_strands(capture, work, sweeps, strands, parameters, workers, progress)], provenance)
-    save_strands(out, strands)
+    with ExitStack() as open_ones:
+        cluster = open_ones.enter_context(Cluster(scheduler, [capture.folder], tell)) if scheduler else None
+        sweeps = find_features(capture, work, parameters, workers, progress, cluster)
+        _check_memory(sweeps, memory_bytes)
+        index = build_index(sweeps, capture.optics)
+        journal = Unwritten()
+        if parameters.paper is not None:
+            grown, error = grow_paper(index, parameters.paper, progress), None
+            radius = np.full(len(grown.points_mm), parameters.paper.radius_mm, np.float32)
+        else:
+            journal = open_ones.enter_context(Journal(_work_path(Path(out)) / JOURNAL, _grown_from(capture, parameters)))
+            with _crew(index, capture, work, Path(out), workers, cluster) as crew:
+                grown = trace(index, parameters.grow, parameters.refine, workers, progress, crew, journal)
+            error = expected_error(index, parameters.grow, parameters.refine, grown.points_mm, grown.offsets, grown.evidence, workers)
+            radius = measured(index, sweeps, grown.points_mm, grown.offsets, parameters.grow, parameters.refine, parameters.radius, workers)
+        if len(grown.offsets) < 2:
+            raise StrandscopeError(
+                f"{capture.folder}: no fiber was found in {sum(map(len, sweeps))} features; expected hairs in focus in the photographs"
+            )
+        provenance = {"capture": capture.name, "version": VERSION, "parameters": asdict(parameters)}
+        strands = captured_strands(grown, error, radius, provenance)
+        if parameters.infill is not None:
+            strands = concatenate([strands, infill_strands(capture, work, sweeps, strands, parameters, workers, progress)], provenance)
+        save_strands(out, strands)
+        journal.delete()
     return strands
+
+
+def _crew(index: Index, capture: Capture, work: Path, out: Path, workers: int, cluster: Cluster | None) -> Threads:
+    """Who grows: threads of this process, or the workers of a cluster."""
+    if cluster is None:
+        return Threads(index, workers)
+    features = [features_path(work, i) for i in range(len(capture.sweeps))]
+    return Hands(cluster, index, workers, features, capture.optics, _work_path(out) / USED_UP)
 
 
 # ---- photographs -> features -----------------------------------------------------------------------------------------
 
 
-def find_features(capture: Capture, work: Path, parameters: Parameters, workers: int, progress: Progress) -> list[SweepFeatures]:
-    """The features of every sweep, filtered from the photographs unless ``work`` has them from a run before, or the capture itself."""
+def find_features(
+    capture: Capture, work: Path, parameters: Parameters, workers: int, progress: Progress, cluster: Cluster | None = None
+) -> list[SweepFeatures]:
+    """The features of every sweep, filtered from the photographs, here or on a cluster, unless ``work`` has them from a run before, or
+    the capture itself."""
     missing = [i for i in range(len(capture.sweeps)) if not all(path(work, i).is_file() for path in _PRODUCTS)]
     shape, total = capture.shape, sum(len(capture.sweeps[i].files) for i in missing)
-    jobs = [(capture, file, parameters, shape) for i in missing for file in capture.sweeps[i].files]
+    jobs = (job for i in missing for job in _jobs(capture, i, parameters, shape))
     done = 0
-    with _processes(workers) as run:
+    with _processes(workers) if cluster is None else nullcontext(cluster.map) as run:
         results = run(_filter, jobs)
         for i in missing:
             sweep, ridges, blues, lights = capture.sweeps[i], [], [], []
@@ -156,6 +180,13 @@ def find_features(capture: Capture, work: Path, parameters: Parameters, workers:
             save_features(features_path(work, i), pack(sweep.angle_deg, sweep.positions_mm, shape, ridges))
     progress("finding ridges", total, total)
     return [load_features(features_path(work, i)) for i in range(len(capture.sweeps))]
+
+
+def _jobs(capture: Capture, i: int, parameters: Parameters, shape: tuple[int, int]) -> Iterator[tuple]:
+    """What there is to do for the photographs of sweep i; of the capture, no more than is needed is sent along."""
+    capture = replace(capture, sweeps=(capture.sweeps[0], capture.sweeps[i]))
+    for file in capture.sweeps[1].files:
+        yield capture, file, parameters, shape
 
 
 def _filter(job: tuple[Capture, str, Parameters, tuple[int, int]]) -> tuple[Ridges, np.ndarray, np.ndarray]:
@@ -250,6 +281,21 @@ def _work_path(out: Path) -> Path:
     return out.with_name(out.stem + ".work")
 
 
+def _grown_from(capture: Capture, parameters: Parameters) -> str:
+    """A digest of all that grown curves depend on."""
+    own = [os.stat(features_path(capture.folder / capture.features, i)) for i in range(len(capture.sweeps))] if capture.features else []
+    told = {
+        "features": None if capture.features else _made_from(capture, parameters),
+        "files": [[stat.st_size, stat.st_mtime_ns] for stat in own],
+        "version": VERSION,
+        "optics": asdict(capture.optics),
+        "sweeps": [asdict(sweep) for sweep in capture.sweeps],
+        "grow": asdict(parameters.grow),
+        "refine": asdict(parameters.refine),
+    }
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
 def _made_from(capture: Capture, parameters: Parameters) -> str:
     """A digest of all that features depend on."""
     stats = [(f, os.stat(capture.folder / f)) for s in capture.sweeps for f in s.files]
@@ -283,18 +329,28 @@ SETTLED = 0.1  # a round that changes nothing by more than this many standard er
 
 
 def calibrate(
-    capture_path: Path, out: Path, parameters: Parameters, *, workers: int = 1, memory_bytes: int = 6 * 10**9, progress: Progress = silent
+    capture_path: Path,
+    out: Path,
+    parameters: Parameters,
+    *,
+    workers: int = 1,
+    memory_bytes: int = 6 * 10**9,
+    progress: Progress = silent,
+    scheduler: str | None = None,
+    tell: Callable[[str], None] = unheard,
 ) -> Calibration:
     """Find the errors of the rig that took a capture from the capture itself, write them to ``out`` (.json, .toml); returns them.
 
-    The photographs are filtered once; then curves are grown with the rig as known so far, the rig is solved for, and so on
-    until it stays. Raises CaptureError, StrandscopeError as ``reconstruct`` does, and where too few fibers are seen.
+    The photographs are filtered once, on a cluster if there is a ``scheduler``; then curves are grown with the rig as known so far,
+    the rig is solved for, and so on until it stays. Raises CaptureError, StrandscopeError as ``reconstruct`` does, and where too few
+    fibers are seen.
     """
-    capture = load_capture(capture_path)
+    capture = load_capture(capture_path if scheduler is None else Path(capture_path).resolve())
     parameters = resolve(capture, replace(parameters, ridges=replace(parameters.ridges, reduce=1)))  # errors are told in whole pixels
     stated = replace(capture, optics=replace(capture.optics, tilt_deg=0.0, tilt_towards_deg=0.0))
     work = work_folder(stated, Path(out), parameters)
-    sweeps = find_features(stated, work, parameters, workers, progress)
+    with Cluster(scheduler, [capture.folder], tell) if scheduler else nullcontext() as cluster:
+        sweeps = find_features(stated, work, parameters, workers, progress, cluster)
     _check_memory(sweeps, 2 * memory_bytes // 3)  # some are turned and joined anew in each round
     errors, solution, biased = _solved(capture, sweeps, parameters, workers, progress)
     told = [gains(np.load(light_path(work, i))) for i in range(len(sweeps))]

@@ -83,6 +83,6 @@ def measured(
     workers: int = 1,
 ) -> np.ndarray:
     """Radius (N,) float32 mm of the points of curves that ``refine.trace`` found, one radius a curve."""
-    found = breadths(index, sweeps, points_mm, offsets, _work(index, refine_params, grow_params, map).slab, workers)
+    found = breadths(index, sweeps, points_mm, offsets, _work(index, refine_params, grow_params).slab, workers)
     lengths = np.diff(offsets)
     return np.repeat(radii(found, lengths, index.pitch, params), lengths).astype(np.float32)

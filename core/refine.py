@@ -5,20 +5,23 @@ A curve is a smoothing spline (``spline.py``): a point every step, tied to the o
 observations likeliest. What compares curves with each other is in ``joining.py``.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-from .features import USED, Index
+from .crew import Threads
+from .features import Index
 from .geometry import turn_back
-from .grow import Grown, GrowParams, box_of, claims_of, find_seeds, grow, grow_end
+from .grow import Grown, GrowParams, box_of, claim, claims_of, find_seeds, grow, grow_end
 from .joining import Curve, Meeting, Passing, bridged, chains, end_of, leading_to, meetings, once, paired, part, passings, turned
-from .look import BOW, Box, chord, claimed, fit, gather, hair_frame, look, new_hits, new_view, shows
+from .journal import Unwritten
+from .look import BOW, Box, chord, fit, gather, hair_frame, look, new_hits, new_view, shows
 from .progress import Progress, silent
 from .spline import Stiffness, across, covariance, smoothed, stiffness
 from .stops import Stop
@@ -286,49 +289,60 @@ class _Work:
     slab: Box  # half a step to either side
     near: Box  # the length over which evidence is weighed
     claims: Box  # what a step uses up
-    each: Callable  # each(function, items): a list, on all threads
-    memo: dict = field(default_factory=dict)  # what was told of curves that have not changed since
+    crew: Threads  # who looks at many curves
+    memo: dict = field(default_factory=dict)  # what was told of curves that have not changed since: {(*key, *ids): (curves, told)}
 
 
-def _remembered(work: _Work, key: tuple, curves: tuple[Curve, ...], tell: Callable):
-    """tell(), or what it was for these very curves before. How the hair bends at large may have changed a little since then."""
-    key = (*key, *map(id, curves))
-    if key not in work.memo:
-        work.memo[key] = curves, tell()  # the curves, so that no other gets their id
-    return work.memo[key][1]
+def _remembered(work: _Work, keys: Sequence[tuple], of: Sequence[tuple[Curve, ...]], function: Callable, items: Sequence, *arguments) -> list:
+    """function(index, item, *arguments) of every item, or what it was for these very curves and key before. How the hair bends at
+    large may have changed a little since then."""
+    keys = [(*key, *map(id, curves)) for key, curves in zip(keys, of, strict=True)]
+    new = [i for i, key in enumerate(keys) if key not in work.memo]
+    for i, told in zip(new, work.crew.each(function, [items[i] for i in new], *arguments), strict=True):
+        work.memo[keys[i]] = of[i], told  # the curves, so that no other gets their id
+    return [work.memo[key][1] for key in keys]
 
 
-def trace(index: Index, grow_params: GrowParams, params: RefineParams, workers: int = 1, progress: Progress = silent) -> Grown:
+def trace(
+    index: Index,
+    grow_params: GrowParams,
+    params: RefineParams,
+    workers: int = 1,
+    progress: Progress = silent,
+    crew: Threads | None = None,
+    journal: Unwritten | None = None,
+) -> Grown:
     """The fibers that the observations support, in rounds: the clearest hair first, so that what it stands on is out of the way
     of the rest. Each round grows curves on what is left, then refines all of them and grows them on.
 
-    The same for any number of ``workers``: each curve is fitted alone, and what compares curves runs in a fixed order.
+    The same for any number of ``workers`` or whatever ``crew`` there is in their place: each curve is fitted alone, and what compares
+    curves runs in a fixed order. It goes on behind what the ``journal`` of an earlier run holds.
     """
     curves: list[Curve] = []
     memo: dict = {}
     seeds = find_seeds(index, grow_params)
+    pages = _Pages(journal or Unwritten(), memo)
     for number, evidence in enumerate(params.step_evidence):
         told = _part_of(progress, number, len(params.step_evidence))
         if curves:  # what bends is foretold less well, and meets more by chance
             bent = bend_at_large(((c.points, c.evidence) for c in curves), grow_params.step_mm)
             evidence = max(evidence, min(params.bent_evidence[0] * bent, params.bent_evidence[1]))
         growing = replace(grow_params, min_evidence=evidence)
-        with ThreadPoolExecutor(workers) as pool:
-            work = _work(index, params, growing, lambda function, items, pool=pool: list(pool.map(function, items)), memo)
+        with Threads(index, workers) if crew is None else nullcontext(crew) as hands:
+            work = _work(index, params, growing, hands, memo)
             if evidence >= params.new_evidence:
-                _mark(curves, work)
-                curves = curves + _curves(grow(index, growing, workers, told, seeds))
+                if not pages.ahead:  # else an earlier run has seen all that is grown here
+                    _mark(curves, work)
+                curves = curves + _curves(grow(index, growing, workers, told, seeds, hands, pages.journal))
             for i, stage in enumerate(STAGES):
                 told("growing", 1 + i / len(STAGES) * (1 / GROWING_SHARE - 1), 1)
-                index.strength[:] &= USED - 1
-                curves = stage(curves, work)
+                curves = pages.stage(stage, curves, work)
             curves = _keep(curves, work)
             alive = set(map(id, curves))
             for key in [key for key, (told_of, _) in memo.items() if not alive.issuperset(map(id, told_of))]:
                 del memo[key]
             if number == len(params.step_evidence) - 1:
-                work.index.strength[:] &= USED - 1
-                curves = _carry_on(curves, work)
+                curves = pages.stage(_carry_on, curves, work)
     progress("growing", 1, 1)
     return _flat(curves, sum(len(cells) for cells, _ in seeds.tried))
 
@@ -338,7 +352,7 @@ def _part_of(progress: Progress, number: int, rounds: int) -> Progress:
     return lambda stage, done, total: progress(stage, number + GROWING_SHARE * done / max(total, 1), rounds)
 
 
-def _work(index: Index, params: RefineParams, grow_params: GrowParams, each: Callable, memo: dict | None = None) -> _Work:
+def _work(index: Index, params: RefineParams, grow_params: GrowParams, crew: Threads | None = None, memo: dict | None = None) -> _Work:
     box, fit = box_of(grow_params, index), box_of(replace(grow_params, sigma_px=params.fit_sigma[0], sigma_focus_mm=params.fit_sigma[1]), index)
     wide = 1.5 * index.pitch
     slab, near = (mm / (2 * box.half[0]) for mm in (box.step, params.near_mm))  # of the length of the box
@@ -349,7 +363,7 @@ def _work(index: Index, params: RefineParams, grow_params: GrowParams, each: Cal
         slab=fit._replace(half=(0.5 * box.step, box.half[1], wide), deep=box.half[1], full_support=slab * fit.full_support),
         near=box._replace(half=(0.5 * params.near_mm, box.half[1], wide), full_support=near * box.full_support),
         claims=claims_of(grow_params, box),
-        each=each,
+        crew=crew or Threads(index),
         memo={} if memo is None else memo,
     )
 
@@ -361,13 +375,10 @@ def _curves(grown: Grown) -> list[Curve]:
 
 def _mark(curves: list[Curve], work: _Work) -> None:
     """Mark the observations that curves stand on as used, and no others."""
-    work.index.strength[:] &= USED - 1
-
-    def claim(curve: Curve) -> np.ndarray:
-        return _remembered(work, ("claimed",), (curve,), lambda: claimed(work.index, np.ascontiguousarray(curve.points), work.claims))
-
-    for numbers in work.each(claim, curves):
-        work.index.strength[numbers] |= USED
+    work.crew.free()
+    of = [(curve,) for curve in curves]
+    for numbers in _remembered(work, [("claimed",)] * len(of), of, claim, [curve.points for curve in curves], work.claims):
+        work.crew.use(numbers)
 
 
 def _at_large(curves: list[Curve], work: _Work) -> float:
@@ -375,17 +386,19 @@ def _at_large(curves: list[Curve], work: _Work) -> float:
 
 
 def _fit_all(curves: list[Curve], work: _Work) -> list[Curve]:
-    bend = _at_large(curves, work)
+    changed = [i for i, curve in enumerate(curves) if not curve.fitted]
+    fits = work.crew.each(_fit_one, [curves[i] for i in changed], work.slab, work.near, work.params, _at_large(curves, work))
+    out = list(curves)
+    for i, curve in zip(changed, fits, strict=True):
+        out[i] = curve
+    return out
 
-    def one(curve: Curve) -> Curve:
-        if curve.fitted:
-            return curve
-        points = _fitted(work.index, np.ascontiguousarray(curve.points), work.slab, work.params, bend)
-        evidence = np.empty(len(points))
-        _weigh(work.index, points, work.near, evidence)
-        return Curve(points, evidence, curve.stops, fitted=True)
 
-    return work.each(one, curves)
+def _fit_one(index: Index, curve: Curve, slab: Box, near: Box, params: RefineParams, bend: float) -> Curve:
+    points = _fitted(index, np.ascontiguousarray(curve.points), slab, params, bend)
+    evidence = np.empty(len(points))
+    _weigh(index, points, near, evidence)
+    return Curve(points, evidence, curve.stops, fitted=True)
 
 
 def _cut_all(curves: list[Curve], work: _Work) -> list[Curve]:
@@ -410,12 +423,10 @@ def _join(curves: list[Curve], work: _Work) -> list[Curve]:
     params, bend = work.params, _at_large(curves, work)
     found = meetings(curves, params.join_mm, params.join_place, params.join_turn_deg, params.join_misfit)
 
-    def tell(meeting: Meeting) -> float:
-        one, two = meeting.ends
-        pair = curves[one // 2], curves[two // 2]
-        return _remembered(work, ("between", one % 2, two % 2), pair, lambda: _between(curves, meeting, work, bend))
-
-    told = work.each(tell, found)
+    of = [tuple(curves[end // 2] for end in meeting.ends) for meeting in found]
+    keys = [("between", meeting.ends[0] % 2, meeting.ends[1] % 2, 0) for meeting in found]
+    both = [_both(curves, meeting, steps_of(JOIN_PART_MM, work.box.step)) for meeting in found]
+    told = _remembered(work, keys, of, _between, both, work.slab, work.near, params, bend)
     worth = [_join_worth(meeting, evidence, params) for meeting, evidence in zip(found, told, strict=True)]
     return chains(curves, paired(found, worth, params.join_least, params.join_margin), work.box.step)
 
@@ -426,16 +437,19 @@ def _join_worth(meeting: Meeting, evidence: float, params: RefineParams) -> floa
     return even - gap * meeting.gap_mm - ill * np.sqrt(meeting.misfit) + seen * min(evidence, 2.0)
 
 
-def _between(curves: list[Curve], meeting: Meeting, work: _Work, bend: float) -> float:
-    """Mean evidence over the gap between two ends, and JOIN_BESIDE_MM to either side, of the one curve that fits both."""
-    most, beside = steps_of(JOIN_PART_MM, work.box.step), steps_of(JOIN_BESIDE_MM, work.box.step)
-    parts = [leading_to(curves, meeting.ends[0]), turned(leading_to(curves, meeting.ends[1]))]
-    parts = [part(parts[0], max(len(parts[0].points) - most, 0), len(parts[0].points)), part(parts[1], 0, min(most, len(parts[1].points)))]
-    both = bridged(parts, work.box.step)
-    points = _fitted(work.index, np.ascontiguousarray(both.points), work.slab, work.params, bend)
+def _both(curves: list[Curve], meeting: Meeting, most: int) -> tuple[Curve, Curve]:
+    """The two curves of a meeting, the second turned, and ``most`` points of each on the side where they meet."""
+    one, other = leading_to(curves, meeting.ends[0]), turned(leading_to(curves, meeting.ends[1]))
+    return part(one, max(len(one.points) - most, 0), len(one.points)), part(other, 0, min(most, len(other.points)))
+
+
+def _between(index: Index, parts: tuple[Curve, Curve], slab: Box, near: Box, params: RefineParams, bend: float) -> float:
+    """Mean evidence over the gap between two curves, and JOIN_BESIDE_MM to either side, of the one curve that fits both."""
+    beside = steps_of(JOIN_BESIDE_MM, near.step)
+    points = _fitted(index, np.ascontiguousarray(bridged(parts, near.step).points), slab, params, bend)
     first, last = len(parts[0].points) - beside, len(points) - len(parts[1].points) + beside
     evidence = np.empty(len(points))
-    _weigh(work.index, points, work.near, evidence)
+    _weigh(index, points, near, evidence)
     return float(evidence[max(first, 0) : last].mean())
 
 
@@ -445,12 +459,10 @@ def _uncross(curves: list[Curve], work: _Work) -> list[Curve]:
     bend = _at_large(curves, work)
     found = passings(curves, UNCROSS_MM, UNCROSS_DEG, steps_of(UNCROSS_INNER_MM, work.box.step))
 
-    def tell(passing: Passing) -> tuple[float, Curve, Curve]:
-        pair = curves[passing.end // 2], curves[passing.other]
-        key = "exchanged", passing.end % 2, passing.at, passing.onward
-        return _remembered(work, key, pair, lambda: _exchanged(curves, passing, work, bend))
-
-    tried = work.each(tell, found)
+    of = [(curves[passing.end // 2], curves[passing.other]) for passing in found]
+    keys = [("exchanged", passing.end % 2, passing.at, int(passing.onward)) for passing in found]
+    items = [_beside(curves, passing) for passing in found]
+    tried = _remembered(work, keys, of, _exchanged, items, work.slab, work.near, work.params, bend)
     taken: set[int] = set()
     out = list(curves)
     for number in sorted(range(len(found)), key=lambda i: (-tried[i][0], i)):
@@ -461,28 +473,34 @@ def _uncross(curves: list[Curve], work: _Work) -> list[Curve]:
     return out
 
 
-def _exchanged(curves: list[Curve], passing: Passing, work: _Work, bend: float) -> tuple[float, Curve, Curve]:
+def _beside(curves: list[Curve], passing: Passing) -> tuple[Curve, Curve, int]:
+    """The curve that ends, the other one turned the same way, and its point beside the end."""
+    own, other = leading_to(curves, passing.end), curves[passing.other]
+    return (own, other, passing.at) if passing.onward else (own, turned(other), len(other.points) - 1 - passing.at)
+
+
+def _exchanged(index: Index, item: tuple[Curve, Curve, int], slab: Box, near: Box, params: RefineParams, bend: float):
     """(how many times more evidence the weakest point has, the piece with what lies beyond on the other curve, what is left of
-    that one), if the other curve is cut where it has least evidence near the end of the piece; 0 where that cannot be."""
-    own = leading_to(curves, passing.end)
-    other = curves[passing.other] if passing.onward else turned(curves[passing.other])
-    at = passing.at if passing.onward else len(other.points) - 1 - passing.at
-    inner, most, edge = (steps_of(mm, work.box.step) for mm in (UNCROSS_INNER_MM, JOIN_PART_MM, UNCROSS_EDGE_MM))
-    near = slice(at - inner + edge, at + inner - edge + 1)
-    dip = near.start + int(np.argmin(other.evidence[near]))
+    that one), if the other curve is cut where it has least evidence near the end of the piece; 0 where that cannot be. No curves
+    unless it is worth it."""
+    own, other, at = item
+    inner, most, edge = (steps_of(mm, near.step) for mm in (UNCROSS_INNER_MM, JOIN_PART_MM, UNCROSS_EDGE_MM))
+    around = slice(at - inner + edge, at + inner - edge + 1)
+    dip = around.start + int(np.argmin(other.evidence[around]))
     own, before, beyond = part(own, 0, len(own.points) - edge), part(other, 0, dip), part(other, dip + edge + 1, len(other.points))
-    if min(map(len, (own.points, before.points, beyond.points))) < steps_of(SHORT_MM, work.box.step):
-        return 0.0, own, other
+    if min(map(len, (own.points, before.points, beyond.points))) < steps_of(SHORT_MM, near.step):
+        return 0.0, None, None
     forward = beyond.points[0] - own.points[-1]
     if forward @ end_of(own.points)[1] < 0.5 * np.linalg.norm(forward):
-        return 0.0, own, other
-    both = bridged([own, beyond], work.box.step)
+        return 0.0, None, None
+    both = bridged([own, beyond], near.step)
     before_it, after_it = (min(len(c.points), most) for c in (own, beyond))
     middle = both.points[len(own.points) - before_it : len(both.points) - len(beyond.points) + after_it]
-    points, evidence = _fitted(work.index, np.ascontiguousarray(middle), work.slab, work.params, bend), np.empty(len(middle))
-    _weigh(work.index, points, work.near, evidence)
+    points, evidence = _fitted(index, np.ascontiguousarray(middle), slab, params, bend), np.empty(len(middle))
+    _weigh(index, points, near, evidence)
     weakest = evidence[max(before_it - 2 * edge, 0) : len(points) - after_it + 2 * edge].min()
-    return float(weakest / max(other.evidence[dip], LEAST_DIP)), both, before
+    times = float(weakest / max(other.evidence[dip], LEAST_DIP))
+    return (times, both, before) if times > params.uncross else (times, None, None)
 
 
 def _carry_on(curves: list[Curve], work: _Work) -> list[Curve]:
@@ -516,7 +534,7 @@ def _carry_on(curves: list[Curve], work: _Work) -> list[Curve]:
             return curve
         return Curve(_fitted(work.index, points, work.slab, params, bend), evidence, curve.stops, fitted=True)
 
-    return work.each(one, range(len(curves)))
+    return work.crew.here(one, range(len(curves)))
 
 
 def _onward(points: np.ndarray, count: int) -> np.ndarray:
@@ -531,21 +549,22 @@ def _onward(points: np.ndarray, count: int) -> np.ndarray:
 def _extend(curves: list[Curve], work: _Work) -> list[Curve]:
     """Grow on from both ends, on what no curve stands on."""
     _mark(curves, work)
-    short = steps_of(SHORT_MM, work.box.step)
-    room = int(10 * work.index.rows * work.index.pitch / work.box.step) + 30
+    longer = work.crew.each(_extended, curves, work.box)
+    return [more or curve for more, curve in zip(longer, curves, strict=True)]
 
-    def one(curve: Curve) -> Curve:
-        points, evidence, stops = curve.points, curve.evidence, list(curve.stops)
-        for end in (1, 0):
-            if stops[end] != Stop.LEFT_VOLUME and len(points) >= short:
-                state, more = np.empty((room, 9)), np.empty(room, np.float32)
-                known, filled, stop = _grow_on(work.index, np.ascontiguousarray(points), work.box, state, more)
-                points, evidence = np.concatenate([points, state[known:filled, :3]]), np.concatenate([evidence, more[known:filled]])
-                stops[end] = int(stop)
-            points, evidence = points[::-1], evidence[::-1]
-        return Curve(points, evidence, tuple(stops)) if len(points) > len(curve.points) else curve
 
-    return work.each(one, curves)
+def _extended(index: Index, curve: Curve, box: Box) -> Curve | None:
+    """A curve grown on, if it grows."""
+    short, room = steps_of(SHORT_MM, box.step), int(10 * index.rows * index.pitch / box.step) + 30
+    points, evidence, stops = curve.points, curve.evidence, list(curve.stops)
+    for end in (1, 0):
+        if stops[end] != Stop.LEFT_VOLUME and len(points) >= short:
+            state, more = np.empty((room, 9)), np.empty(room, np.float32)
+            known, filled, stop = _grow_on(index, np.ascontiguousarray(points), box, state, more)
+            points, evidence = np.concatenate([points, state[known:filled, :3]]), np.concatenate([evidence, more[known:filled]])
+            stops[end] = int(stop)
+        points, evidence = points[::-1], evidence[::-1]
+    return Curve(points, evidence, tuple(stops)) if len(points) > len(curve.points) else None
 
 
 def _keep(curves: list[Curve], work: _Work) -> list[Curve]:
@@ -561,6 +580,78 @@ def _keep(curves: list[Curve], work: _Work) -> list[Curve]:
 
 _TIDY = (_fit_all, _cut_all, _once, _uncross, _join, _fit_all)
 STAGES = (*_TIDY, _extend, *_TIDY)  # of a round
+
+
+class _Pages:
+    """The curves after each stage, in a journal. A record holds the curves that the one before it has not, and what is remembered."""
+
+    def __init__(self, journal: Unwritten, memo: dict):
+        self.journal, self.memo = journal, memo
+        self.table: list[Curve] = []  # curves of the last record
+
+    @property
+    def ahead(self) -> bool:
+        """Whether an earlier run came to another stage."""
+        return self.journal.ahead("curves")
+
+    def stage(self, stage: Callable, curves: list[Curve], work: _Work) -> list[Curve]:
+        """The curves after a stage, with no observation used up before it; or what they were."""
+        told = self.journal.next("curves")
+        if told is not None:
+            return self._read(told)
+        work.crew.free()
+        curves = [_settled(curve) for curve in stage(curves, work)]
+        if self.journal.kept:
+            self._write(curves)
+        return curves
+
+    def _write(self, curves: list[Curve]) -> None:
+        alive = set(map(id, curves))
+        kept = [(key, of, told) for key, (of, told) in self.memo.items() if key[0] in _TOLD and alive.issuperset(map(id, of))]
+        exchanged = [curve for _, _, told in kept if isinstance(told, tuple) for curve in told[1:] if curve is not None]
+        before, table = {id(curve): i for i, curve in enumerate(self.table)}, list({id(curve): curve for curve in (*curves, *exchanged)}.values())
+        number = {id(curve): i for i, curve in enumerate(table)}
+        new = [curve for curve in table if id(curve) not in before]
+        rows = []
+        for key, of, told in kept:
+            made = [-1 if curve is None else number[id(curve)] for curve in (told[1:] if isinstance(told, tuple) else (None, None))]
+            rows.append([_TOLD.index(key[0]), *key[1:4], *(number[id(curve)] for curve in of), *made])
+        self.journal.write(
+            "curves",
+            count=np.array(len(curves)),
+            known=np.array([before.get(id(curve), -1) for curve in table], np.int64),
+            sizes=np.array([len(curve.points) for curve in new], np.int64),
+            points=np.concatenate([np.zeros((0, 3)), *(curve.points for curve in new)]),
+            evidence=np.concatenate([np.zeros(0), *(curve.evidence for curve in new)]),
+            ends=np.array([(*curve.stops, curve.fitted) for curve in new], np.uint8).reshape(-1, 3),
+            remembered=np.array(rows, np.int64).reshape(-1, 8),
+            told=np.array([told[0] if isinstance(told, tuple) else told for _, _, told in kept], np.float64),
+        )
+        self.table = table
+
+    def _read(self, told: Mapping) -> list[Curve]:
+        offsets = np.concatenate([[0], np.cumsum(told["sizes"])])
+        new = (
+            Curve(told["points"][a:b], told["evidence"][a:b], (int(first), int(last)), bool(fitted))
+            for (a, b), (first, last, fitted) in zip(pairwise(offsets), told["ends"], strict=True)
+        )
+        self.table = [next(new) if i < 0 else self.table[i] for i in told["known"]]
+        self.memo.clear()
+        for (name, *key, one, two, own, other), value in zip(told["remembered"].tolist(), told["told"].tolist(), strict=True):
+            made = [None if i < 0 else self.table[i] for i in (own, other)]
+            of = self.table[one], self.table[two]
+            self.memo[(_TOLD[name], *key, *map(id, of))] = of, value if _TOLD[name] == "between" else (value, *made)
+        return self.table[: int(told["count"])]
+
+
+_TOLD = ("between", "exchanged")  # what is remembered that depends on more than the curves
+
+
+def _settled(curve: Curve) -> Curve:
+    """The curve with arrays that lie in memory as they do when they are read from a file: sums depend on it."""
+    if curve.points.flags.c_contiguous and curve.evidence.flags.c_contiguous:
+        return curve
+    return replace(curve, points=np.ascontiguousarray(curve.points), evidence=np.ascontiguousarray(curve.evidence))
 
 
 def _flat(curves: list[Curve], tried: int) -> Grown:

@@ -29,6 +29,10 @@ class Reporter:
         """A result for the reader, on stdout."""
         print(text, flush=True)
 
+    def note(self, text: str) -> None:
+        """What a reader should know while the work goes on; one line on stderr."""
+        print(f"strandscope: {text}", file=sys.stderr, flush=True)
+
     def done(self, output: Path) -> None:
         """The work succeeded, and what came of it is at ``output``."""
 
@@ -86,6 +90,9 @@ class Bars(Reporter):
         self._bars.stop()
         super().show(text)
 
+    def note(self, text):
+        self._bars.console.print(f"strandscope: {text}", highlight=False, markup=False, soft_wrap=True)
+
     def failed(self, message):
         self._bars.stop()
         super().failed(message)
@@ -111,6 +118,9 @@ class Events(Reporter):
 
     def show(self, text):
         """Left out: a program reads files and events."""
+
+    def note(self, text):
+        self._print(event="note", message=text)
 
     def done(self, output):
         self._print(event="done", output=str(output))

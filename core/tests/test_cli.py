@@ -13,7 +13,7 @@ from strandscope.core import cli
 from strandscope.core.cli import common, main_group, run
 from strandscope.core.errors import StrandscopeError
 
-VERBS = ["simulate", "import", "calibrate", "reconstruct", "overlay", "figures", "stats", "score", "accuracy", "bench"]
+VERBS = ["simulate", "import", "calibrate", "reconstruct", "batch", "overlay", "figures", "stats", "score", "accuracy", "bench"]
 
 
 def group_of(work):
@@ -78,6 +78,8 @@ def test_without_a_verb_the_help_is_shown(capsys):
         (["reconstruct", "lock", "-o", "x.npz", "--workers", "0"], "--workers"),
         (["reconstruct", "lock", "-o", "x.npz", "--preset", "bald"], "'bald'"),
         (["reconstruct", "lock", "-o", "x.npz", "--infill", "9", "--no-infill"], "exclude each other"),
+        (["batch", "-o", "x"], "expected one or more"),
+        (["batch", "lock", "-o", "x", "--infill", "9", "--no-infill"], "exclude each other"),
         (["overlay", "lock", "x.npz", "-o", "x.png", "--sweep", "1", "--angle", "15"], "exclude each other"),
         (["figures", "lock", "out", "--fiber", "3", "--height", "1"], "exclude each other"),
         (["figures", "lock", "out", "--at", "1,2"], "expected three"),

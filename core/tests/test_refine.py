@@ -101,7 +101,7 @@ def test_pieces_that_were_exchanged_go_back():
     """Two fibers cross 0.1 mm apart; one curve goes from the first over to the second, and a piece of either is left over."""
     first, second = (line((0, 0, z), (x, 1, 0))[::20] for z, x in ((0, 0.15), (0.1, -0.15)))
     index = build_index(observe([line((0, 0, 0), (0.15, 1, 0)), line((0, 0, 0.1), (-0.15, 1, 0))], Seen(angles=24)), OPTICS)
-    work = _work(index, RefineParams(), GrowParams(), lambda function, items: list(map(function, items)))
+    work = _work(index, RefineParams(), GrowParams())
     parts = [first[20:39], first[42:60], second[20:39], second[42:60]]
     wrong = bridged([Curve(parts[0], np.full(19, 9.0), (0, 0)), Curve(parts[3], np.full(18, 9.0), (0, 0))], 0.1)
     curves = _fit_all([wrong, Curve(parts[1], np.full(18, 9.0), (0, 0)), Curve(parts[2], np.full(19, 9.0), (0, 0))], work)
