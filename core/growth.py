@@ -24,7 +24,13 @@ RESULT, PICTURE, CAPTURES = "growth.json", "growth.png", "captures"
 WARM, WARM_PHOTOGRAPHS = Lock(6, 0.8, 60, 8), Lock(6, 0.8, 60, 2, photographed=True)
 QUANTITIES = {"seconds": "time (s)", "memory_bytes": "memory beyond the program's (MB)"}
 LEAST_BYTES = 1_000_000  # below this, memory is that of a program, not of its data
-AXES = {"photographs": "photographs", "fibers": "fibers, equally dense", "density": "fibers a mm², in the same volume", "workers": "workers"}
+AXES = {
+    "photographs": "photographs",
+    "fibers": "fibers, equally dense",
+    "density": "fibers a mm², in the same volume",
+    "features": "millions of features, of all these",
+    "workers": "workers",
+}
 
 
 @dataclass(frozen=True)
@@ -107,7 +113,8 @@ def cases(params: GrowthParams) -> list[Case]:
 
 
 def _on_axis(axis: str, stage: str, params: GrowthParams) -> Iterator[tuple[float, Case]]:
-    """The cases of one stage along one axis, and the axis' value (photographs: sweeps)."""
+    """The cases of one stage along one axis, and the axis' value; of photographs and features, which are known only afterwards, another
+    that tells the cases apart."""
     one, base_radius = min(params.workers), _radius_mm(params.base_fibers, params)
     base = Lock(params.base_fibers, base_radius, params.rows, params.base_sweeps)
     if stage == "filter":  # sees neither fibers nor their density, but pixels
@@ -125,6 +132,9 @@ def _on_axis(axis: str, stage: str, params: GrowthParams) -> Iterator[tuple[floa
     elif axis == "density":
         across_mm2 = pi * base_radius**2
         yield from ((n / across_mm2, Case(stage, Lock(n, base_radius, base.rows, base.sweeps), base.sweeps, one)) for n in params.density)
+    elif axis == "features":
+        sizes = [case for other in ("photographs", "fibers", "density") for _, case in _on_axis(other, stage, params)]
+        yield from enumerate(dict.fromkeys(sizes))
     elif stage != "index":  # which one thread builds
         yield from ((n, Case(stage, base, base.sweeps, n)) for n in params.workers)
 
@@ -217,16 +227,18 @@ def series(report: dict, params: GrowthParams, axis: str) -> list[Series]:
     """What was measured along an axis of ``AXES``; stages that do not depend on it, or were not measured, are left out."""
     found = []
     for stage in params.stages:
-        measured = {x: report["measured"][case.key] for x, case in _on_axis(axis, stage, params) if case.key in report["measured"]}
-        if not measured:
+        points = [(x, report["measured"][case.key]) for x, case in _on_axis(axis, stage, params) if case.key in report["measured"]]
+        if not points:
             continue
-        x = [rounds[0]["photographs"] if axis == "photographs" else x for x, rounds in measured.items()]
+        if axis in ("photographs", "features"):
+            points = [(rounds[0][axis] / (1e6 if axis == "features" else 1), rounds) for _, rounds in points]
+        points.sort(key=lambda point: point[0])
         rounds = {
-            "seconds": [[one["seconds"] for one in point] for point in measured.values()],
-            "memory_bytes": [[max(one["peak_bytes"] - one["program_bytes"], LEAST_BYTES) for one in point] for point in measured.values()],
+            "seconds": [[one["seconds"] for one in point] for _, point in points],
+            "memory_bytes": [[max(one["peak_bytes"] - one["program_bytes"], LEAST_BYTES) for one in point] for _, point in points],
         }
-        median = {name: np.array([np.median(point) for point in points]) for name, points in rounds.items()}
-        found.append(Series(stage, np.array(x, float), median, rounds))
+        median = {name: np.array([np.median(point) for point in values]) for name, values in rounds.items()}
+        found.append(Series(stage, np.array([x for x, _ in points], float), median, rounds))
     return found
 
 
@@ -247,11 +259,15 @@ def describe(report: dict, params: GrowthParams) -> list[tuple[str, str] | None]
 
 
 def _row_text(one: Series) -> str:
-    ends = [f"{one.x[0]:.3g} to {one.x[-1]:.3g}"]
+    ends = [f"{_number(one.x[0])} to {_number(one.x[-1])}"]
     for name, size, unit in (("seconds", 1, "s"), ("memory_bytes", 1e6, "MB")):
         y = one.median[name] / size
         ends.append(f"{y[0]:.3g} to {y[-1]:.3g} {unit}{_power(fit(one.x, y), ', as x to the ')}")
     return "; ".join(ends)
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if value >= 100 else f"{value:.2g}" if value < 10 else f"{value:.3g}"
 
 
 def _power(found: Fit, before: str) -> str:
@@ -309,10 +325,10 @@ def _finish(axes, found: Sequence[Series]) -> None:
     axes.set(xscale="log", yscale="log")
     ticks = []
     for x in np.unique(np.concatenate([one.x for one in found])):
-        ticks += [x] if not ticks or x > 1.4 * ticks[-1] else []
+        ticks += [x] if not ticks or x > 1.45 * ticks[-1] else []
     axes.xaxis.set_major_locator(FixedLocator(ticks))
     axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _number(value)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
     x_low, x_high = (end(np.concatenate([one.x for one in found])) for end in (np.min, np.max))

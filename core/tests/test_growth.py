@@ -140,7 +140,7 @@ def test_the_exponent_is_that_of_the_law(exponent):
 def test_what_is_linear_is_told_as_linear(tmp_path):
     params = GrowthParams(rounds=2)
     report = grow_out(tmp_path, params)
-    wanted = {"photographs": 1, "fibers": 1, "density": 1, "workers": -1}
+    wanted = {"photographs": 1, "fibers": 1, "density": 1, "features": 1, "workers": -1}
     for axis in AXES:
         for one in series(report, params, axis):
             assert fit(one.x, one.median["seconds"]).exponent == pytest.approx(wanted[axis])
