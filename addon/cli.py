@@ -1,6 +1,7 @@
 """The verbs that need Blender: ``blend`` and ``turntable``, in the program ``strandscope`` and in ``blender --command``."""
 
 import importlib.util
+import re
 
 import click
 
@@ -10,6 +11,20 @@ from ..core.errors import StrandscopeError
 from ..core.strands import load_strands
 
 NO_BLENDER = 'Blender is not here; run this as `blender --command strandscope …`, or install Blender for Python: pip install "bpy==5.2.*"'
+
+
+class Part(click.ParamType):
+    """I/N, as two numbers."""
+
+    name = "I/N"
+
+    def convert(self, value, param, ctx):
+        if not isinstance(value, str):
+            return value
+        match = re.fullmatch(r"(\d+)/(\d+)", value)
+        if not match or not 1 <= int(match[1]) <= int(match[2]):
+            self.fail(f"{value!r} is no part; expected I/N, as in 2/4", param, ctx)
+        return int(match[1]), int(match[2])
 
 
 @click.command(short_help="Make a Blender file of the curves.")
@@ -38,21 +53,23 @@ def blend(session, strands, out, capture):
 @click.option("--angles", type=click.IntRange(1), default=4, show_default=True, help="Photographs to compare with, evenly around the hair.")
 @click.option("--size", type=click.IntRange(16), default=360, show_default=True, metavar="PX", help="Pixels along the longer side of a picture.")
 @click.option("--samples", type=click.IntRange(1), default=16, show_default=True, help="Rays a pixel: more take longer and have less grain.")
+@click.option("--part", type=Part(), help="Render the I-th of N parts of the pictures only, and compare nothing: for N machines at once.")
 @common
 @click.pass_obj
-def turntable(session, capture, strands, out, angles, size, samples):
+def turntable(session, capture, strands, out, angles, size, samples, part):
     """Render the curves of a strands file as the photographs of CAPTURE show the hair, and set both side by side.
 
     OUT is the picture to write (.png), or a folder for the picture and all its frames. It compares with the capture's
     turntable photographs; a capture without them lends those of its sweeps that are focused on the axis. The exposure is
-    matched. Frames that are there already are kept, so an interrupted run continues.
+    matched. Frames that are there already are kept, so an interrupted run continues, and machines can share the work: first each
+    with its --part, the first part before the others, then one of them without.
 
     \b
     Example:
       strandscope turntable lock out/strands.npz out/turntable.png --angles 6
     """
     photographs, curves = load_capture(capture), load_strands(strands)
-    session.report.done(_turntable().render_turntable(photographs, curves, out, angles, size, samples, session.report))
+    session.report.done(_turntable().render_turntable(photographs, curves, out, angles, size, samples, session.report, part))
 
 
 def full_group() -> click.Group:

@@ -65,14 +65,22 @@ def shots(capture: Capture, count: int) -> list[Shot]:
 
 
 def render_turntable(
-    capture: Capture, strands: Strands, out: Path, angles: int = 4, size: int = 360, samples: int = 16, progress: Progress = silent
+    capture: Capture,
+    strands: Strands,
+    out: Path,
+    angles: int = 4,
+    size: int = 360,
+    samples: int = 16,
+    progress: Progress = silent,
+    part: tuple[int, int] | None = None,
 ) -> Path:
     """Render strands as the photographs of a capture show them, and set both side by side. Returns the picture's path.
 
     out: the picture to write (.png; the frames go to a folder ``NAME_frames`` beside it), or a folder for both, where it is
     ``turntable.png``. Frames ``render_000.png`` and their linear ``.exr`` that are there already, of the same strands and
-    settings, are kept. size: pixels along the longer side. Raises CaptureError for a photograph that cannot be read and
-    StrandscopeError for what cannot be written.
+    settings, are kept. size: pixels along the longer side. part: (i, n) renders the i-th (from 1) of n parts of the frames, and sets
+    nothing side by side; returns the folder. Others may do other parts at once, when the first has begun its rendering. Raises
+    CaptureError for a photograph that cannot be read and StrandscopeError for what cannot be written.
     """
     out = Path(out)
     picture, folder = (out, out.with_name(f"{out.stem}_frames")) if out.suffix.lower() == ".png" else (out / "turntable.png", out)
@@ -83,7 +91,10 @@ def render_turntable(
     _claim(folder, _identity(strands, view, chosen, width, height, samples))
     melanin = material.melanin_of(sidebyside.hair_brightness(photographs))
     frames = [folder / f"render_{i:03d}.exr" for i in range(len(chosen))]
-    _render(strands, view, chosen, frames, (width, height), samples, melanin, progress)
+    wanted = range(len(chosen)) if part is None else range(part[0] - 1, len(chosen), part[1])
+    _render(strands, view, chosen, frames, wanted, (width, height), samples, melanin, progress)
+    if part is not None:
+        return folder
     renderings = [read_planes(frame, "RGBA") for frame in frames]
     exposure = sidebyside.match(photographs, renderings)
     pairs = [(exposure.develop(p), exposure.develop(exposure.expose(r))) for p, r in zip(photographs, renderings, strict=True)]
@@ -186,10 +197,10 @@ def _claim(folder: Path, identity: dict) -> None:
         part.write_text(text, encoding="utf-8")
 
 
-def _render(strands, view, chosen, frames, resolution, samples, melanin, progress: Progress) -> None:
-    """Render the frames that are missing, in a scene of its own that is gone afterwards."""
-    missing = [i for i, frame in enumerate(frames) if not frame.is_file()]
-    progress(PROGRESS_STAGE, len(frames) - len(missing), len(frames))
+def _render(strands, view, chosen, frames, wanted: range, resolution, samples, melanin, progress: Progress) -> None:
+    """Render those of the ``wanted`` frames that are missing, in a scene of its own that is gone afterwards."""
+    missing = [i for i in wanted if not frames[i].is_file()]
+    progress(PROGRESS_STAGE, len(wanted) - len(missing), len(wanted))
     if not missing:
         return
     before = {kind: set(getattr(bpy.data, kind)) for kind in _KINDS}
@@ -203,7 +214,8 @@ def _render(strands, view, chosen, frames, resolution, samples, melanin, progres
         for i in missing:
             rig.turn(chosen[i].angle_deg)
             rig.focus(chosen[i].focus_mm)
-            _render_frame(scene, frames[i], i, len(frames), progress)
+            scene.cycles.seed = i
+            _render_frame(scene, frames[i], wanted.index(i), len(wanted), progress)
     finally:
         for kind in _KINDS:
             blocks = getattr(bpy.data, kind)
@@ -234,7 +246,6 @@ def _render_frame(scene: bpy.types.Scene, out: Path, index: int, count: int, pro
             except BaseException as error:  # Blender would print what a handler raises and go on
                 stopped.append(error)
 
-    scene.cycles.seed = index
     bpy.app.handlers.render_stats.append(watch)
     try:
         with atomic(out) as part:

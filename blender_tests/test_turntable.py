@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from strandscope.addon import hair, rig_scene, turntable
+from strandscope.addon.cli import run_all
 from strandscope.core.capture import Turntable
 from strandscope.core.errors import StrandscopeError, StrandsError
 
@@ -141,6 +142,32 @@ def test_turntable_keeps_its_frames_and_goes_on(tmp_path, capture, strands):
     assert len(second.read_bytes()) == len(content)
     turntable.render_turntable(capture, strands, tmp_path / "a.png", **(QUICK | {"samples": 2}))
     assert first.stat().st_mtime_ns != stamp  # of other settings
+
+
+def test_parts_of_the_frames_come_to_the_same_as_all_at_once(tmp_path, capture, strands):
+    together, apart = tmp_path / "together", tmp_path / "apart"
+    whole = turntable.render_turntable(capture, strands, together, **QUICK)
+    for part in ((1, 2), (2, 2)):
+        assert turntable.render_turntable(capture, strands, apart, **QUICK, part=part) == apart
+    assert sorted(path.name for path in apart.glob("*.exr")) == ["render_000.exr", "render_001.exr"]
+    assert not (apart / "turntable.png").exists()
+    kept = [path.stat().st_mtime_ns for path in sorted(apart.glob("*.exr"))]
+    picture = turntable.render_turntable(capture, strands, apart, **QUICK)
+    assert [path.stat().st_mtime_ns for path in sorted(apart.glob("*.exr"))] == kept
+    with Image.open(picture) as found, Image.open(whole) as wanted:
+        assert found.size == wanted.size
+        np.testing.assert_allclose(np.asarray(found, float), np.asarray(wanted, float), atol=2)
+
+
+def test_more_parts_than_frames_leave_some_nothing_to_do(tmp_path, capture, strands):
+    turntable.render_turntable(capture, strands, tmp_path, **QUICK, part=(3, 3))
+    assert not list(tmp_path.glob("*.exr"))
+
+
+@pytest.mark.parametrize("part", ["0/2", "3/2", "1", "a/b"])
+def test_a_part_that_is_none_is_told(part, capsys):
+    assert run_all(["turntable", "lock", "strands.npz", "out", "--part", part]) == 2
+    assert "expected I/N, as in 2/4" in capsys.readouterr().err
 
 
 def test_turntable_can_be_stopped(tmp_path, capture, strands):

@@ -17,7 +17,7 @@ from .errors import StrandscopeError
 from .files import atomic
 from .pipeline import preset, reconstruct
 from .progress import Progress, silent
-from .simulate import SCALES, SimulateParams, plan, simulate
+from .simulate import SimulateParams, plan, simulate
 
 METHODS = {"ours": "strandscope", "paper": "paper"}  # as the table names them: as the pipeline does
 RESULTS = "results"
@@ -148,7 +148,7 @@ def _check_room(folder: Path, listed: Sequence[Lock]) -> None:
 
 def _bytes(lock: Lock) -> int:
     """Size of the photographs of a simulated capture: mosaics of 16 bit."""
-    scale, capture = SCALES[lock.params.scale], plan(lock.capture, lock.params)
+    scale, capture = lock.params.size, plan(lock.capture, lock.params)
     return (sum(len(sweep.files) for sweep in capture.sweeps) + scale.turntable) * 8 * scale.rows * scale.columns
 
 

@@ -676,6 +676,36 @@ def bench(session, stages, json_file, plot, rounds):
     benchmark.expect_same(report)
 
 
+@main_group.command(short_help="Measure how time and memory grow with the size of a capture.")
+@click.argument("out", type=PATH)
+@click.option("--rounds", type=click.IntRange(1), default=3, show_default=True, help="How often each is measured; the median is told.")
+@click.option("--workers", type=Words(int), metavar="1,2,…", help="Numbers of workers to measure with.  [default: 1, 2, 4, … up to all cores]")
+@click.option("--quick", is_flag=True, help="A few very small captures, once: to see that it works, not to learn from.")
+@common
+@click.pass_obj
+def growth(session, out, rounds, workers, quick):
+    """Measure how time and memory of each stage grow with photographs, fibers, their density, and workers.
+
+    Simulates captures of several sizes in the folder OUT, and runs each stage on each of them in a process of its own. Leaves
+    all measurements in OUT/growth.json, and a plot of them in OUT/growth.png, with what would be linear and the exponent of what
+    is. Takes a quarter of an hour, and is of use only while the machine does little else. A run that was interrupted goes on
+    where it stopped.
+
+    \b
+    Example:
+      strandscope growth out/growth
+    """
+    from . import growth as harness
+
+    counts = workers or tuple(2**i for i in range((os.cpu_count() or 1).bit_length()))
+    params = replace(harness.QUICK if quick else harness.GrowthParams(rounds=rounds), workers=counts)
+    report = harness.grow_out(out, params, session.report)
+    session.report.done(out / harness.RESULT)
+    harness.plot(report, params, out / harness.PICTURE)
+    session.report.show(terminal.table(harness.describe(report, params)))
+    session.report.done(out / harness.PICTURE)
+
+
 def _hand_over(session: Session, numbers: dict, text: str, json_file: Path | None) -> None:
     """Numbers to a JSON file if one is wanted, their text to the reader."""
     if json_file:

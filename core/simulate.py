@@ -92,7 +92,7 @@ class SimulateParams:
     """What to simulate. The optics are those of sec. 3; the same parameters give the same bytes."""
 
     style: str = "straight"  # one of groom.STYLES
-    scale: str = "small"  # one of SCALES
+    scale: str | Scale = "small"  # one of SCALES, or a size of its own
     fibers: int | None = None  # None: as many as the scale has
     seed: int = 0
     working_distance_mm: float = 330.0
@@ -105,6 +105,11 @@ class SimulateParams:
     open_f_number: float = 2.8  # the f-number at which the aperture has the cone above
     turntable_f_number: float = 16.0
     misalignment: Misalignment = Misalignment()
+
+    @property
+    def size(self) -> Scale:
+        """The scale itself, where it has a name."""
+        return self.scale if isinstance(self.scale, Scale) else SCALES[self.scale]
 
 
 @dataclass(frozen=True)
@@ -617,13 +622,13 @@ def _visible(ends, strand, span, spots, turn, points, own, view, axis, shape):
 
 def plan(out: Path, params: SimulateParams) -> Capture:
     """The capture that ``params`` will give, before a photograph is taken. Raises StrandscopeError for a wrong parameter."""
-    if params.scale not in SCALES:
+    if not isinstance(params.scale, Scale) and params.scale not in SCALES:
         raise StrandscopeError(f"scale is {params.scale!r}; expected one of {', '.join(SCALES)}")
     if params.style not in STYLES:
         raise StrandscopeError(f"style is {params.style!r}; expected one of {', '.join(STYLES)}")
     if params.fibers is not None and params.fibers < 1:
         raise StrandscopeError(f"fibers is {params.fibers}; expected 1 or more")
-    scale = SCALES[params.scale]
+    scale = params.size
     optics = Optics(params.working_distance_mm, params.pitch_mm, (scale.columns - 1) / 2, (scale.rows - 1) / 2, params.aperture_cone_deg)
     count = round(2 * scale.half_range_mm / params.step_mm) + 1
     positions = tuple(round((i - (count - 1) / 2) * params.step_mm, 6) for i in range(count))
@@ -660,7 +665,7 @@ def simulate(out: Path, params: SimulateParams, progress: Progress = silent, wor
 
 def lock_params(params: SimulateParams) -> GroomParams:
     """The lock that fits the scale: it goes on above and below the image, as far as blurred hair is seen."""
-    scale = SCALES[params.scale]
+    scale = params.size
     half_height = scale.rows / 2 * params.pitch_mm
     beyond = 1.5 + 0.25 * scale.lock_radius_mm + 0.1 * half_height
     return GroomParams(params.style, params.fibers or scale.fibers, scale.lock_radius_mm, half_height + beyond)
@@ -697,7 +702,7 @@ def begin(out: Path, params: SimulateParams, more: dict | None = None) -> bool:
 
 def _photographs(capture: Capture, hair: Hair, params: SimulateParams, progress: Progress, pool: ThreadPoolExecutor) -> None:
     """Take all photographs that are not there yet."""
-    scale, optics, look = SCALES[params.scale], capture.optics, LOOKS[params.style]
+    scale, optics, look = params.size, capture.optics, LOOKS[params.style]
     background = board(optics, (scale.rows, scale.columns), look)
     fog = density(hair)
     gain = _gain(hair, fog, look, params)
@@ -768,7 +773,7 @@ def _write_truth(capture: Capture, lock: Groom, hair: Hair, params: SimulatePara
 
 def seen_volume(params: SimulateParams) -> tuple[float, float]:
     """Radius and half height (mm) of the cylinder that every sweep sees, less a margin."""
-    scale, pitch, margin = SCALES[params.scale], params.pitch_mm, 0.1
+    scale, pitch, margin = params.size, params.pitch_mm, 0.1
     return min((scale.columns - 1) / 2 * pitch, scale.half_range_mm) - margin, (scale.rows - 1) / 2 * pitch - margin
 
 

@@ -23,7 +23,7 @@ from .hull import HullParams
 from .pipeline import blueness_path, light_path
 from .progress import Progress, silent
 from .ridges import Ridges
-from .simulate import SCALES, Samples, SimulateParams, begin, each_of, lock_params, plan, prepare, samples, seen_volume, visibility, write_truth
+from .simulate import Samples, SimulateParams, begin, each_of, lock_params, plan, prepare, samples, seen_volume, visibility, write_truth
 
 FOLDER = "features"  # in the capture
 PAPER_FIBERS = 6500  # of a whole switch, as the paper fills it
@@ -66,7 +66,7 @@ def simulate_features(
         return load_capture(out)
     lock = _kept_groom(out / "groom.npz", params, progress)
     hair = prepare(lock, np.random.default_rng([params.seed, 1]))
-    scale, rig = SCALES[params.scale], params.misalignment.errors(capture).corrected(capture)
+    scale, rig = params.size, params.misalignment.errors(capture).corrected(capture)
     at = samples(lock, np.inf, scale.rows / 2 * params.pitch_mm + 1.0)
     seen = np.zeros((len(at.points_mm), len(capture.sweeps)), np.float16)
     shape = scale.rows, scale.columns

@@ -13,7 +13,7 @@ from strandscope.core import cli
 from strandscope.core.cli import common, main_group, run
 from strandscope.core.errors import StrandscopeError
 
-VERBS = ["simulate", "import", "calibrate", "reconstruct", "batch", "overlay", "figures", "stats", "score", "accuracy", "bench"]
+VERBS = ["simulate", "import", "calibrate", "reconstruct", "batch", "overlay", "figures", "stats", "score", "accuracy", "bench", "growth"]
 
 
 def group_of(work):
