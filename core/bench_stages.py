@@ -18,7 +18,7 @@ from .grow import GrowParams, box_of
 from .laplace import KNOWN, OUTSIDE, UNKNOWN, laplace_fill
 from .look import BOW, GATE, Box, fit, look, new_view, unit
 from .raw import read_planes
-from .ridges import BINS, COARSE_EVERY, COARSE_PX, RidgeParams, Ridges, detect, estimate, gabor_bank, line_banks
+from .ridges import BINS, RidgeParams, Ridges, Strokes, detect, estimate, gabor_bank, strokes
 from .simulate import BLACK, WHITE
 
 NO_OPENCV = "OpenCV is not installed, so it was left out; to compare with it, run: pip install opencv-python-headless"
@@ -53,7 +53,6 @@ def _ridges(params: BenchParams, _folder: Path) -> tuple[list[Contest], list[str
     photograph, cv2 = plane(params.rows, params.columns, params.seed), library("cv2")
     ours, papers = (estimate([photograph], RidgeParams(operator=operator, reduce=1)) for operator in ("oriented", "paper"))
     what = f"a photograph of {params.columns} x {params.rows} pixels to ridges"
-    coarse = line_banks(ours.across_px, COARSE_PX)[0]
     others = [
         Way("scikit-image, sato", partial(sato, photograph, sigmas=SCALES_PX, black_ridges=False), partial(_bright_at_ridges, "sato")),
         Way(
@@ -66,20 +65,25 @@ def _ridges(params: BenchParams, _folder: Path) -> tuple[list[Contest], list[str
         others.insert(0, Way("OpenCV, 32 filters", partial(_opencv_bank, cv2, photograph, gabor_bank()), _same_angles))
     note = "The others give a response a pixel and no ridges: no maxima, no runs, no place below a pixel. The photograph's offset is known."
     contests = [
-        Contest("ridges", what, Way("ours", partial(detect, photograph, ours)), others, _dense(photograph, coarse[::COARSE_EVERY]), notes=[note])
+        Contest("ridges", what, Way("ours", partial(detect, photograph, ours)), others, _stroked(photograph, strokes(ours.across_px)), notes=[note])
     ]
     if cv2:
         same_bins = Way("OpenCV, 32 filters", partial(_opencv_bank, cv2, photograph, gabor_bank()), _same_bins)
         way = Way("ours, operator of the paper", partial(detect, photograph, papers))
-        contests.append(Contest("ridges", f"{what}, by the paper's filters", way, [same_bins], _dense(photograph, gabor_bank())))
+        contests.append(Contest("ridges", f"{what}, by the paper's filters", way, [same_bins], _bounded(photograph)))
     return contests, [] if cv2 else [NO_OPENCV]
 
 
-def _dense(photograph: np.ndarray, bank: np.ndarray) -> Least:
-    """What even filters (B, k, k) at every pixel take: pairs of pixels are added, then each is multiplied and added."""
-    folded = (bank.shape[1] ** 2 + 1) // 2
-    flops = photograph.size * (folded - 1 + 2 * len(bank) * folded)
-    return Least(5 * photograph.nbytes, flops, f"{len(bank)} filters {bank.shape[1]} x {bank.shape[1]} at every pixel")
+def _bounded(photograph: np.ndarray) -> Least:
+    """What the paper's operator takes at every pixel: two passes of a blur of nine pixels (13 each), and the bound on its peak (about 60)."""
+    return Least(4 * photograph.nbytes, 86.0 * photograph.size, "a blur and a bound at every pixel")
+
+
+def _stroked(photograph: np.ndarray, marks: Strokes) -> Least:
+    """What the strokes at every pixel take: second differences across four axes, averaged along them (45), and of each stroke a
+    product and a maximum, and three more for each pair of places."""
+    flops = 45 + 2 * len(marks.axis) + 3 * np.count_nonzero(marks.weight[:, 1:])
+    return Least(5 * photograph.nbytes, float(photograph.size * flops), f"{len(marks.axis)} strokes at every pixel")
 
 
 def _opencv_bank(cv2, photograph: np.ndarray, bank: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
