@@ -50,7 +50,6 @@ FAR_FIRST = (0, 4, 2, 6, 1, 5, 3, 7)  # the order of the groups
 RASTERED = 4  # parts in which layers are counted
 BATCH = 64  # seeds grown against the same observations; part of the result, not of the machine
 PART = 8  # of them that are grown together
-AT_REST = 0.1  # of gamma: a seed that is drawn by no more has come to rest
 DEEP, FOCUS = 2.3, 0.5  # of sigma_focus: how far along a ribbon a camera's depth is looked for, and how well it must agree
 OBSERVED_TOGETHER = 17.0  # observations of one camera in a step that err alike: rows and frames that see the same
 
@@ -253,8 +252,6 @@ def _snap(index, p, g, least, box, view):
         moved = np.sqrt(np.sum(place**2))
         if np.sqrt(np.sum((p - start) ** 2)) > 3 * box.half[2]:
             return 0.0, p, g, bend
-        if trial > 1 and moved < AT_REST * box.gamma:
-            break
     return evidence if moved < 2 * box.gamma else 0.0, p, g, bend
 
 
