@@ -318,10 +318,10 @@ def stroke_answer(plane: np.ndarray, axis: int, places, weights, apart: int) -> 
 # What bounds the oriented operator. Twenty strokes are some 180 flops a pixel, eight pixels at once, and tell the quarter of the pixels
 # (where hair is dense) at which a hair may be. There the patch of 11 x 11 is folded, pixels at +(j, i) and -(j, i) being added, which
 # halves the work, and the 32 filters are one matrix product for BATCH of them, 3904 flops each at the speed of sgemm: a quarter of the
-# time. A tenth of the pixels are crests, and there the patch is one of 19 x 19 and five filters or so are asked: another quarter.
+# time. A tenth of the pixels are crests, and there the patch is one of 19 x 19 and five filters or so are asked: a fifth.
 #
 # The paper's operator need not ask where no direction can have a peak of the least height; see ``_may_peak``. The blur and this
-# bound, at every pixel, are three quarters of its time.
+# bound, at every pixel, are about half of its time.
 
 
 def _folded(bank: np.ndarray) -> np.ndarray:
