@@ -14,10 +14,9 @@ import numpy as np
 from .features import Index
 from .grow import GrowParams
 from .refine import RefineParams, _work, bend_at_large, ties
-from .spline import across, covariance
+from .spline import BEND_MM, across, covariance, steps_of
 
 SURE_MM = 0.02  # confidence is the chance to lie this near to a centreline
-BEND_MM = 0.4  # to either side: the length over which curvature is measured
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ def expected_error(
     The observations that curves stand on must not be marked as used, as ``trace`` leaves them. The same for any number of
     ``workers``.
     """
-    half = max(round(BEND_MM / grow_params.step_mm), 1)
+    half = steps_of(BEND_MM, grow_params.step_mm)
     bend = bend_at_large(((points_mm[a:b], evidence[a:b]) for a, b in pairwise(offsets)), grow_params.step_mm)
 
     def one(ends: tuple[int, int]) -> np.ndarray:

@@ -518,8 +518,8 @@ class Seeds:
             at = np.flatnonzero(sweeps >= least)
             return layers[part][at // (nx * nz)] * (nx * nz) + at % (nx * nz), PROMISED[0] * sweeps.ravel()[at]
 
-        half = -(-len(layers) // RASTERED)
-        parts = list(pool.map(work, [slice(i, i + half) for i in range(0, len(layers), max(half, 1))]))
+        size = max(-(-len(layers) // RASTERED), 1)
+        parts = list(pool.map(work, [slice(i, i + size) for i in range(0, len(layers), size)]))
         return tuple(np.concatenate([part[i] for part in parts] or [np.zeros(0, int)]) for i in range(2))
 
     def _layers(self, phase: int) -> np.ndarray:

@@ -40,7 +40,7 @@ def laplace_fill(values: np.ndarray, kinds: np.ndarray, cycles: int = 12, tolera
     inner = u[1:-1, 1:-1, 1:-1]
     for c in range(filled.shape[3]):
         inner[:] = np.where(kinds == KNOWN, values[..., c], 0)
-        _start(u, levels)
+        _start(u, levels, rooms[0])
         _climb(u, levels, cycles, tolerance, rooms)
         filled[..., c] = inner
     return filled
@@ -65,13 +65,14 @@ def _climb(u, levels, cycles, tolerance, rooms):
             return
 
 
-def _start(u, levels):
-    """Coarse to fine: the means of the known values, solved on the coarser grid, are the first guess of the finer one."""
+def _start(u, levels, nothing):
+    """Coarse to fine: the means of the known values, solved on the coarser grid, are the first guess of the finer one. ``nothing``: an
+    array like u, which becomes 0."""
     if len(levels) > 1:
         coarse = _coarser_values(u, levels[0].kinds, levels[1].kinds)
-        _start(coarse, levels[1:])
+        _start(coarse, levels[1:], np.empty_like(coarse))
         _prolong(coarse, levels[1].kinds, levels[0].count, levels[0].span, u)
-    nothing = np.zeros_like(u)
+    nothing[:] = 0
     for _ in range(_START_SWEEPS if len(levels) > 1 else 2 * _SWEEPS_OF_FEW):
         _relax(u, nothing, levels[0].count, levels[0].span, True)
 

@@ -119,17 +119,10 @@ def reconstruct(
         cluster = open_ones.enter_context(Cluster(scheduler, [capture.folder], tell)) if scheduler else None
         sweeps = find_features(capture, work, parameters, workers, progress, cluster)
         _check_memory(sweeps, memory_bytes)
-        index = build_index(sweeps, capture.optics)
         journal = Unwritten()
-        if parameters.paper is not None:
-            grown, error = grow_paper(index, parameters.paper, progress), None
-            radius = np.full(len(grown.points_mm), parameters.paper.radius_mm, np.float32)
-        else:
+        if parameters.paper is None:
             journal = open_ones.enter_context(Journal(_work_path(Path(out)) / JOURNAL, _grown_from(capture, parameters)))
-            with _crew(index, capture, work, Path(out), workers, cluster) as crew:
-                grown = trace(index, parameters.grow, parameters.refine, workers, progress, crew, journal)
-            error = expected_error(index, parameters.grow, parameters.refine, grown.points_mm, grown.offsets, grown.evidence, workers)
-            radius = measured(index, sweeps, grown.points_mm, grown.offsets, parameters.grow, parameters.refine, parameters.radius, workers)
+        grown, error, radius = _grown(capture, work, Path(out), sweeps, parameters, workers, progress, cluster, journal)
         if len(grown.offsets) < 2:
             raise StrandscopeError(
                 f"{capture.folder}: no fiber was found in {sum(map(len, sweeps))} features; expected hairs in focus in the photographs"
@@ -141,6 +134,30 @@ def reconstruct(
         save_strands(out, strands)
         journal.delete()
     return strands
+
+
+def _grown(
+    capture: Capture,
+    work: Path,
+    out: Path,
+    sweeps: list[SweepFeatures],
+    parameters: Parameters,
+    workers: int,
+    progress: Progress,
+    cluster: Cluster | None,
+    journal: Unwritten,
+) -> tuple[Grown, np.ndarray | None, np.ndarray]:
+    """The fibers in the features of all sweeps, the error to be expected of their points (N,), if it is known, and their radius (N,).
+    The index, which is as large as the features, is gone when they are found."""
+    index = build_index(sweeps, capture.optics)
+    if parameters.paper is not None:
+        grown = grow_paper(index, parameters.paper, progress)
+        return grown, None, np.full(len(grown.points_mm), parameters.paper.radius_mm, np.float32)
+    with _crew(index, capture, work, out, workers, cluster) as crew:
+        grown = trace(index, parameters.grow, parameters.refine, workers, progress, crew, journal)
+    error = expected_error(index, parameters.grow, parameters.refine, grown.points_mm, grown.offsets, grown.evidence, workers)
+    radius = measured(index, sweeps, grown.points_mm, grown.offsets, parameters.grow, parameters.refine, parameters.radius, workers)
+    return grown, error, radius
 
 
 def _crew(index: Index, capture: Capture, work: Path, out: Path, workers: int, cluster: Cluster | None) -> Threads:

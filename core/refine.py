@@ -23,7 +23,7 @@ from .joining import Curve, Meeting, Passing, bridged, chains, end_of, leading_t
 from .journal import Unwritten
 from .look import BOW, Box, chord, fit, gather, hair_frame, look, new_hits, new_view, shows
 from .progress import Progress, silent
-from .spline import Stiffness, across, covariance, smoothed, stiffness
+from .spline import BEND_MM, Stiffness, across, covariance, smoothed, steps_of, stiffness
 from .stops import Stop
 
 _turn_back = njit(turn_back)
@@ -32,7 +32,6 @@ SLAB_MM = 0.1
 GROWING_SHARE = 0.6  # of the time of a round
 BEND_PX = 3.6  # sigma along the hair of what places a ridge, hair's width and slab included: it sees a bend from inside
 JOIN_PART_MM, JOIN_BESIDE_MM = 4.0, 0.2  # of either curve that a join looks at, and of the end itself
-BEND_MM = 0.4  # to either side: the length over which a curvature is told
 CHORD_MM, KNOWN_MM = 0.2, 2.0  # to either side: what gives a point its direction; and the end of a curve that tells where it goes on
 STRAIGHT = 1e-3  # 1/mm: hair is taken for no straighter
 UNCROSS_MM, UNCROSS_DEG = 0.2, 20.0  # how near an end must be to another curve to claim the rest of it, and how much turned
@@ -115,7 +114,7 @@ def _tie(seen, points, move, box, normal, right):
     right (n, 3) of its least squares, in cameras that see it fully. The place of an observation is that of the hair's image
     averaged along it, which lies by half the curvature times BEND_PX squared inside a bend."""
     n, cameras, f32 = len(points), seen.ribbon.shape[1], np.float32
-    reach = min(max(round(BEND_MM / box.step), 1), (n - 1) // 2)
+    reach = min(steps_of(BEND_MM, box.step), (n - 1) // 2)
     inside = 0.5 * (BEND_PX * box.pixel) ** 2
     over, bow, one, none = f32(1 / box.sigma), f32(BOW), f32(1), f32(0)
     for j in range(n):
@@ -201,11 +200,6 @@ def _fitted(index: Index, points: np.ndarray, box: Box, params: RefineParams, be
     return _fit(index, points, box, params, bend)[0]
 
 
-def steps_of(length_mm: float, step_mm: float) -> int:
-    """How many steps are nearest to a length, one at least."""
-    return max(round(length_mm / step_mm), 1)
-
-
 def _bends(points: np.ndarray, step_mm: float) -> np.ndarray:
     """Squares (m,) of the curvature (1/mm) of a curve of points (n, 3) in one direction across it, over BEND_MM to either side, at
     all points that have as much."""
@@ -231,7 +225,7 @@ def bend_at_large(curves: Iterable[tuple[np.ndarray, np.ndarray]], step_mm: floa
 def _weigh(index, points, box, evidence):
     """Evidence (n,) of each point (n, 3) of a curve that is already where it should be."""
     n = len(points)
-    view, free, reach = new_view(len(index.cos)), (1e9, 1e9, 1e9), max(round(CHORD_MM / box.step), 1)
+    view, free, reach = new_view(len(index.cos)), (1e9, 1e9, 1e9), steps_of(CHORD_MM, box.step)
     for j in range(n):
         if j % 2 == 1 and j < n - 1:  # the boxes of neighbours share two thirds
             continue
@@ -255,7 +249,7 @@ def _grow_on(index, points, box, state, evidence):
     """Grow on from the last of points (n, 3); fills state (m, 9) and evidence (m,), which begin with the points' own last
     ones. Returns (rows of the points', rows there are, Stop)."""
     n = len(points)
-    known, reach = min(max(round(KNOWN_MM / box.step), 1), n), max(round(CHORD_MM / box.step), 1)
+    known, reach = min(steps_of(KNOWN_MM, box.step), n), steps_of(CHORD_MM, box.step)
     for i in range(known):
         j = n - known + i
         a, b = max(j - reach, 0), min(j + reach, n - 1)

@@ -7,6 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+BEND_MM = 0.4  # to either side: the length over which a curvature is told
+
+
+@njit(cache=True, nogil=True)
+def steps_of(length_mm, step_mm):
+    """How many steps are nearest to a length, one at least."""
+    return max(round(length_mm / step_mm), 1)
+
 
 class Stiffness(NamedTuple):
     """How a curve bends before anything is known of it, told by the second differences of its points, which are its curvature
