@@ -54,7 +54,7 @@ class Cluster:
         self.address, self.files, self.tell = scheduler, tuple(str(Path(file).resolve()) for file in files), tell
         try:
             self._client = distributed.Client(scheduler, timeout=CONNECT_S, set_as_default=False)
-        except (OSError, ValueError, TypeError, ImportError) as error:
+        except Exception as error:  # what it raises depends on the address and the moment: AssertionError for tls without certificates
             raise StrandscopeError(f"{scheduler}: no scheduler answers there; expected the address of a `dask scheduler`, tcp://HOST:PORT") from error
         self._threads, self._counted, self._alone_since, self._told = 0, -np.inf, None, False
 
