@@ -30,8 +30,7 @@ def laplace_fill(values: np.ndarray, kinds: np.ndarray, cycles: int = 12, tolera
 
     kinds (nx, ny, nz) uint8: KNOWN cells keep their values and are the boundary condition; through the faces towards
     OUTSIDE cells and the grid's border nothing flows. At most so many V-cycles, until the residual is nowhere above the tolerance (of the
-    mean of six neighbours minus the cell).
-    Cells that no KNOWN one is connected with become alike, whatever it is.
+    mean of six neighbours minus the cell). Cells that no KNOWN one is connected with become alike, whatever it is.
     """
     levels = [_level(np.pad(np.asarray(kinds, np.uint8), 1, constant_values=OUTSIDE))]
     while levels[-1].kinds.size > _FEW_CELLS:

@@ -1,14 +1,19 @@
-"""A capture of noise, small enough to be made anew for each test."""
+"""Captures that many tests look at: one of noise, small enough to be made anew for each test, and a lock that has been reconstructed."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from strandscope.core.pipeline import preset, reconstruct
 from strandscope.core.raw import write_dng
+from strandscope.core.simulate import SimulateParams
+from strandscope.core.simulate_features import simulate_features
 
 BLACK, WHITE = 512, 15871
+CAPTURED_ONLY = replace(preset(), infill=None)
 
 
 @pytest.fixture
@@ -29,3 +34,12 @@ def make_capture(folder: Path) -> Path:
     head = {"format": "strandscope-capture", "version": 1, "name": "noise", "optics": optics, "sweeps": sweeps}
     (folder / "capture.json").write_text(json.dumps(head))
     return folder
+
+
+@pytest.fixture(scope="session")
+def lock(tmp_path_factory) -> tuple[Path, bytes]:
+    """A capture that comes with features, and the bytes of a run alone that nothing disturbs."""
+    folder = tmp_path_factory.mktemp("features")
+    simulate_features(folder / "lock", SimulateParams(style="wavy", scale="tiny", fibers=6, seed=5))
+    reconstruct(folder / "lock", folder / "whole.npz", CAPTURED_ONLY)
+    return folder / "lock", (folder / "whole.npz").read_bytes()

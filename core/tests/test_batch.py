@@ -10,12 +10,12 @@ from strandscope.core.batch import batch, names, read_list
 from strandscope.core.cli import run
 from strandscope.core.errors import StrandscopeError
 from strandscope.core.grow import GrowParams
-from strandscope.core.pipeline import preset, reconstruct
+from strandscope.core.pipeline import reconstruct
 from strandscope.core.simulate import SimulateParams
 from strandscope.core.simulate_features import simulate_features
 from strandscope.core.strands import load_strands
 
-CAPTURED_ONLY = replace(preset(), infill=None)
+from .conftest import CAPTURED_ONLY
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ import os
 import signal
 import threading
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,16 +15,14 @@ from strandscope.core.cluster import Cluster, Hands
 from strandscope.core.crew import Threads
 from strandscope.core.errors import StrandscopeError
 from strandscope.core.features import USED, build_index, load_features, save_features
-from strandscope.core.pipeline import preset, reconstruct
+from strandscope.core.pipeline import reconstruct
 from strandscope.core.simulate import SimulateParams, simulate
-from strandscope.core.simulate_features import simulate_features
 
+from .conftest import CAPTURED_ONLY
 from .known import OPTICS, line, observe
 
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.filterwarnings("ignore")  # of Dask's own
-
-CAPTURED_ONLY = replace(preset(), infill=None)
 
 
 @pytest.fixture(scope="module")
@@ -34,15 +31,6 @@ def pair():
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=logging.CRITICAL) as made:
         yield made
-
-
-@pytest.fixture(scope="module")
-def lock(tmp_path_factory):
-    """A capture that comes with features, and the bytes of a run alone."""
-    folder = tmp_path_factory.mktemp("features")
-    simulate_features(folder / "lock", SimulateParams(style="wavy", scale="tiny", fibers=6, seed=5))
-    reconstruct(folder / "lock", folder / "whole.npz", CAPTURED_ONLY)
-    return folder / "lock", (folder / "whole.npz").read_bytes()
 
 
 def workers_of(made) -> dict[str, int]:

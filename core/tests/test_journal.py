@@ -1,7 +1,6 @@
 """A run that is cut short anywhere goes on behind what it has found, and ends with the bytes of an undisturbed one."""
 
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,11 +10,10 @@ from strandscope.core.errors import StrandscopeError
 from strandscope.core.features import build_index
 from strandscope.core.grow import GrowParams
 from strandscope.core.journal import Journal
-from strandscope.core.pipeline import preset, reconstruct
+from strandscope.core.pipeline import reconstruct
 from strandscope.core.refine import RefineParams, trace
-from strandscope.core.simulate import SimulateParams
-from strandscope.core.simulate_features import simulate_features
 
+from .conftest import CAPTURED_ONLY
 from .known import OPTICS, Seen, helix, line, observe, wave
 
 RECORDS = [{"numbers": np.arange(5)}, {"none": np.zeros((0, 3))}, {"numbers": np.float32([[0.5]])}]
@@ -192,18 +190,6 @@ def test_growing_goes_on_from_a_journal_that_is_torn_at_any_record(sweeps, alone
 
 
 # ---- a whole run -----------------------------------------------------------------------------------------------------
-
-
-CAPTURED_ONLY = replace(preset(), infill=None)
-
-
-@pytest.fixture(scope="module")
-def lock(tmp_path_factory):
-    """A capture that comes with features, and the bytes of a run that nothing disturbs."""
-    folder = tmp_path_factory.mktemp("features")
-    simulate_features(folder / "lock", SimulateParams(style="wavy", scale="tiny", fibers=6, seed=5))
-    reconstruct(folder / "lock", folder / "whole.npz", CAPTURED_ONLY)
-    return folder / "lock", (folder / "whole.npz").read_bytes()
 
 
 @pytest.mark.parametrize("share", [0.05, 0.5, 0.9])
