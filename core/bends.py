@@ -15,6 +15,7 @@ from scipy.signal import savgol_filter
 
 _DEGREE = 4  # of the local polynomials
 _MOST_SEGMENTS = 20_000  # of a spectrum: more would tell nothing new
+_FINER = 4  # frequencies of a spectrum for each that a segment can tell apart: a smoother curve through the same numbers
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Spectrum(NamedTuple):
 
     @property
     def power(self) -> np.ndarray:
-        """(F,) of both together: over all frequencies (1/mm) it sums up to the variance of the signal."""
+        """(F,) of both together: its integral over all frequencies (1/mm) is the variance of the signal."""
         return self.right + self.left
 
     @property
@@ -61,7 +62,9 @@ class Spectrum(NamedTuple):
         if 0 < k < len(power) - 1 and np.all(power[k - 1 : k + 2] > 0):
             before, here, after = np.log(power[k - 1 : k + 2])
             shift = 0.5 * (before - after) / (before - 2 * here + after)
-        return float(self.wavelength_mm[0] / (k + 1 + shift))
+        frequency = 1 / self.wavelength_mm
+        apart = frequency[1] - frequency[0] if len(frequency) > 1 else 0.0
+        return float(1 / (frequency[0] + (k + shift) * apart))
 
 
 def evenly(points_mm: np.ndarray, offsets: np.ndarray, step_mm: float, ends: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -158,22 +161,26 @@ def spectrum(signal: np.ndarray, offsets: np.ndarray, step_mm: float, segment_mm
     """Power of a signal (N,), real or complex, along curves sampled at an even arc length, by wavelength.
 
     Runs of finite values (and keep (N,) bool) are cut into segments of segment_mm that overlap by half; of each the mean is taken off and
-    a Hann window laid over it. Wavelengths are segment_mm / 1, 2, 3, … down to two steps; the first holds what lasts longer, too.
+    a Hann window laid over it. Wavelengths are segment_mm / 1, 1.25, 1.5, … down to two steps; the first ones hold what lasts longer, too.
     """
     count = max(round(segment_mm / step_mm), 4)
     good = np.isfinite(signal) if keep is None else np.isfinite(signal) & keep
     starts = _segments(good, np.asarray(offsets), count)
     starts = starts[np.linspace(0, len(starts) - 1, min(len(starts), _MOST_SEGMENTS)).astype(int)] if len(starts) else starts
-    half = count // 2
-    wavelength = count * step_mm / np.arange(1, half + 1)
+    fine = _FINER * count
+    number = np.arange(_FINER, fine // 2 + 1)
+    wavelength = fine * step_mm / number
     if not len(starts):
-        return Spectrum(wavelength, np.full(half, np.nan), np.full(half, np.nan), 0)
+        return Spectrum(wavelength, np.full(len(number), np.nan), np.full(len(number), np.nan), 0)
     window = np.hanning(count + 1)[:-1]
-    parts = signal[starts[:, None] + np.arange(count)]
-    parts = (parts - parts.mean(axis=1, keepdims=True)) * window
-    power = (np.abs(np.fft.fft(parts, axis=1)) ** 2).mean(axis=0) * step_mm / np.sum(window**2)
-    right, left = power[1 : half + 1].copy(), power[::-1][:half].copy()
-    if count % 2 == 0:  # the last frequency is its own mirror
+    power = np.zeros(fine)
+    for some in np.array_split(starts, -(-len(starts) // 1000)):
+        parts = signal[some[:, None] + np.arange(count)]
+        parts = (parts - parts.mean(axis=1, keepdims=True)) * window
+        power += (np.abs(np.fft.fft(parts, fine, axis=1)) ** 2).sum(axis=0)
+    power *= step_mm / (np.sum(window**2) * len(starts))
+    right, left = power[number], power[-number]
+    if fine % 2 == 0:  # the last frequency is its own mirror
         right[-1], left[-1] = 0.5 * right[-1], 0.5 * left[-1]
     return Spectrum(wavelength, right, left, len(starts))
 

@@ -572,22 +572,40 @@ def figures(session, capture, out, strands, height, at, fiber, sweep, only, zoom
 @main_group.command(short_help="Count and measure the hairs of a strands file.")
 @click.argument("strands", type=PATH)
 @click.option("--json", "json_file", type=PATH, help="Write the numbers to this file too.")
+@click.option("--plots", type=PATH, metavar="F.png", help="Draw the distributions, captured and infill over each other.")
+@click.option("--beside", type=PATH, metavar="OTHER.npz", help="Set other hair beside it: another strands file, or a truth.npz.")
+@click.option("--inside", type=Numbers(), metavar="LOW,HIGH", help="Look between these two heights only, in mm.  [default: all]")
 @common
 @click.pass_obj
-def stats(session, strands, json_file):
-    """Count and measure the hairs of a strands file, as the paper's results do.
+def stats(session, strands, json_file, plots, beside, inside):
+    """Count and measure the hairs of a strands file, as the paper's results do, and how they lie together.
 
     Prints the number of curves, how many of them cross a horizontal plane on average, their lengths, and how many were
-    captured and how many added inside.
+    captured and how many added inside. Below, for the captured ones and those added, side by side: density, distance and
+    angle of the nearest neighbour, curvature, torsion, clumps, flyaways and radii, each as a median and, in parentheses,
+    what 5 % stay below and above. docs/statistics.md says what each means.
 
     \b
     Example:
-      strandscope stats out/strands.npz --json out/stats.json
+      strandscope stats out/strands.npz --json out/stats.json --plots out/stats.png
+      strandscope stats out/strands.npz --beside lock/truth.npz --inside=-5,5
     """
-    from .strands import describe, load_strands, statistics
+    if inside is not None and len(inside) != 2:
+        raise click.UsageError(f"--inside has {len(inside)} numbers; expected two, LOW,HIGH")
+    from . import statistics_page
+    from .statistics import describe, load_hair, side_by_side
+    from .strands import describe as describe_counts
+    from .strands import load_strands, statistics
 
-    numbers = statistics(load_strands(strands))
-    _hand_over(session, numbers, terminal.table(describe(numbers)), json_file)
+    hair = load_strands(strands)
+    numbers, rows = statistics(hair), []
+    if len(hair):
+        report = side_by_side(hair, load_hair(beside) if beside else None, inside, progress=session.report)
+        numbers, rows = numbers | report, [None, *describe(report, beside and beside.name)]
+        if plots:
+            statistics_page.plot(report, plots, beside and beside.name)
+            session.report.done(plots)
+    _hand_over(session, numbers, terminal.table([*describe_counts(statistics(hair)), *rows]), json_file)
 
 
 @main_group.command(short_help="Compare found hairs with the hairs that are there.")

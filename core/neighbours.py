@@ -6,6 +6,7 @@ ring after ring, until what it has found is nearer than anything farther out can
 curve with the lower number, so neither the number of threads nor the size of the cells has a say in the result.
 """
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import NamedTuple
@@ -46,16 +47,20 @@ def nearest_other(
     """The nearest other curve of each point of curves, within a distance.
 
     points_mm (N, 3), offsets (M + 1,): the curves, each with at least 2 points. reach_mm: how far to look; np.inf is allowed and
-    slow where a point is far from all else. among (M,) bool: the curves that count as neighbours; asking (M,) bool: those whose
-    points ask (others find nothing); None: all. A curve is never its own neighbour, so that one that comes back to itself does not
-    find itself. The direction at a point is that of the chord between the points before and after it, and on a segment it goes over
-    evenly from that of one end to that of the other. Raises StrandscopeError for shapes that do not fit, and points that are not finite.
+    slow where a point is far from all else. among (M,) bool: the curves that count as neighbours; None: all. asking: the curves whose
+    points ask (M,) bool, or the points that ask (N,) bool, while others find nothing; None: all.
+
+    A curve is never its own neighbour, so that one that comes back to itself does not find itself. The direction at a point is that of
+    the chord between the points before and after it, and on a segment it goes over evenly from that of one end to that of the other.
+    Raises StrandscopeError for shapes that do not fit, and points that are not finite.
     """
     points, offsets, among, asking = _checked(points_mm, offsets, reach_mm, among, asking)
     grid, curve_of, tangents = _gridded(points, offsets, among), _curve_of(offsets), _tangents(points, offsets)
-    distance, angle, segment, share = _in_pieces(
-        lambda low, high: _nearest(low, high, points, tangents, curve_of, asking, float(reach_mm), *grid), len(points)
-    )
+
+    def work(low, high):
+        return _nearest(low, high, points, tangents, curve_of, asking, float(reach_mm), *grid)
+
+    distance, angle, segment, share = _in_pieces(work, 0, len(points))
     return Nearest(distance, angle, np.where(segment == _NONE, _NONE, curve_of[segment]), segment, share)
 
 
@@ -66,15 +71,31 @@ def pairs_within(
 
     32 bytes a pair, and up to twice as much again while it works: with hair as dense as ρ fibers per mm², expect π ρ reach² pairs a point.
     """
+    parts = list(pairs_in_turn(points_mm, offsets, reach_mm, among, asking))
+    return Pairs(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def pairs_in_turn(
+    points_mm: np.ndarray,
+    offsets: np.ndarray,
+    reach_mm: float,
+    among: np.ndarray | None = None,
+    asking: np.ndarray | None = None,
+    at_a_time: int = 16 * _PIECE,
+) -> Iterator[Pairs]:
+    """The same pairs, those of so many points at a time; with at least one part, which may be empty."""
     points, offsets, among, asking = _checked(points_mm, offsets, reach_mm, among, asking)
     grid, curve_of, tangents = _gridded(points, offsets, among), _curve_of(offsets), _tangents(points, offsets)
-    return Pairs(
-        *_in_pieces(lambda low, high: _pairs(low, high, points, tangents, curve_of, asking, float(reach_mm), *grid, len(among)), len(points))
-    )
+
+    def work(low, high):
+        return _pairs(low, high, points, tangents, curve_of, asking, float(reach_mm), *grid, len(among))
+
+    for low in range(0, max(len(points), 1), at_a_time):
+        yield Pairs(*_in_pieces(work, low, min(low + at_a_time, len(points))))
 
 
 def _checked(points_mm, offsets, reach_mm, among, asking):
-    """The arrays as the kernels want them."""
+    """The arrays as the kernels want them; asking (N,)."""
     points, offsets = np.ascontiguousarray(points_mm, np.float64), np.ascontiguousarray(offsets, np.int64)
     if points.ndim != 2 or points.shape[1] != 3 or not np.all(np.isfinite(points)):
         raise StrandscopeError(f"neighbours: points have shape {points.shape}; expected (N, 3), all finite")
@@ -82,13 +103,14 @@ def _checked(points_mm, offsets, reach_mm, among, asking):
         raise StrandscopeError(f"neighbours: offsets do not fit {len(points)} points; expected 0 … {len(points)}, each curve with at least 2 points")
     if not reach_mm > 0:
         raise StrandscopeError(f"neighbours: reach_mm is {reach_mm}; expected more than 0")
-    masks = []
-    for name, mask in (("among", among), ("asking", asking)):
-        mask = np.ones(len(offsets) - 1, bool) if mask is None else np.ascontiguousarray(mask, bool)
-        if mask.shape != (len(offsets) - 1,):
-            raise StrandscopeError(f"neighbours: {name} has shape {mask.shape}; expected one value a curve ({len(offsets) - 1},)")
-        masks.append(mask)
-    return points, offsets, *masks
+    sizes = np.diff(offsets)
+    among = np.ones(len(sizes), bool) if among is None else np.ascontiguousarray(among, bool)
+    asking = np.ones(len(points), bool) if asking is None else np.ascontiguousarray(asking, bool)
+    if among.shape != (len(sizes),):
+        raise StrandscopeError(f"neighbours: among has shape {among.shape}; expected one value a curve ({len(sizes)},)")
+    if asking.shape not in ((len(sizes),), (len(points),)):
+        raise StrandscopeError(f"neighbours: asking has shape {asking.shape}; expected one value a curve ({len(sizes)},) or a point ({len(points)},)")
+    return points, offsets, among, asking if len(asking) == len(points) else np.repeat(asking, sizes)
 
 
 def _curve_of(offsets):
@@ -96,9 +118,9 @@ def _curve_of(offsets):
     return np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
 
 
-def _in_pieces(work, count):
-    """The arrays that ``work`` (low, high) returns for pieces of ``count`` points, each joined in order; a thread takes a piece at a time."""
-    bounds = [*range(0, count, _PIECE), count] if count else [0, 0]
+def _in_pieces(work, start, end):
+    """The arrays that ``work`` (low, high) returns for pieces of points start … end - 1, joined in order; a thread takes a piece at a time."""
+    bounds = [*range(start, end, _PIECE), end] if end > start else [start, start]
     with ThreadPoolExecutor(get_num_threads()) as threads:
         pieces = list(threads.map(lambda ends: work(*ends), pairwise(bounds)))
     return [np.concatenate(arrays) for arrays in zip(*pieces, strict=True)]
@@ -218,7 +240,7 @@ def _nearest(start, end, points, tangents, curve_of, asking, reach, low, cell, s
     segment = np.full(count, _NONE, np.int64)
     for p in range(start, end):
         own = curve_of[p]
-        if not asking[own]:
+        if not asking[p]:
             continue
         x, y, z = points[p, 0] - low[0], points[p, 1] - low[1], points[p, 2] - low[2]
         i0, j0, k0 = _cell_of(x, cell, shape[0]), _cell_of(y, cell, shape[1]), _cell_of(z, cell, shape[2])
@@ -266,7 +288,7 @@ def _pairs(start, end, points, tangents, curve_of, asking, reach, low, cell, sha
     total, wide = 0, reach + slack
     for p in range(start, end):
         own, near = curve_of[p], 0
-        if not asking[own]:
+        if not asking[p]:
             continue
         x, y, z = points[p, 0] - low[0], points[p, 1] - low[1], points[p, 2] - low[2]
         for i in range(_cell_of(x - wide, cell, shape[0]), _cell_of(x + wide, cell, shape[0]) + 1):

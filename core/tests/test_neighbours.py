@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from strandscope.core.errors import StrandscopeError
-from strandscope.core.neighbours import nearest_other, pairs_within
+from strandscope.core.neighbours import nearest_other, pairs_in_turn, pairs_within
 
 
 def flat(curves):
@@ -74,6 +74,10 @@ def test_all_within_reach_are_those_of_trying_all():
     np.testing.assert_array_equal(pairs.curve, other)
     np.testing.assert_allclose(pairs.distance_mm, distances[point, other], atol=1e-12)
     np.testing.assert_allclose(pairs.angle, angles[point, other], atol=1e-6)
+    parts = list(pairs_in_turn(points, offsets, 1.5, at_a_time=7))
+    assert len(parts) == -(-len(points) // 7)
+    for whole, joined in zip(pairs, (np.concatenate(arrays) for arrays in zip(*parts, strict=True)), strict=True):
+        np.testing.assert_array_equal(whole, joined)
 
 
 def test_long_segments_are_as_near_as_short_ones():
@@ -93,6 +97,10 @@ def test_only_curves_that_count_are_neighbours_and_only_those_that_ask_are_told(
     near = nearest_other(points, offsets, 2.0, among=np.array([False, False, True, True]), asking=np.array([True, False, True, False]))
     np.testing.assert_allclose(near.distance_mm.reshape(4, 11), np.broadcast_to([[0.3], [np.inf], [0.4], [np.inf]], (4, 11)))
     np.testing.assert_array_equal(near.curve.reshape(4, 11)[:, 0], [2, -1, 3, -1])
+    some = np.arange(44) % 3 == 0
+    np.testing.assert_array_equal(
+        nearest_other(points, offsets, 2.0, asking=some).curve, np.where(some, nearest_other(points, offsets, 2.0).curve, -1)
+    )
     pairs = pairs_within(points, offsets, 0.35, among=np.array([True, True, True, False]))
     assert set(zip(pairs.point // 11, pairs.curve, strict=True)) == {(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)}
 
