@@ -120,7 +120,9 @@ def _curve_of(offsets):
 
 def _in_pieces(work, start, end):
     """The arrays that ``work`` (low, high) returns for pieces of points start … end - 1, joined in order; a thread takes a piece at a time."""
-    bounds = [*range(start, end, _PIECE), end] if end > start else [start, start]
+    if end - start <= _PIECE:
+        return work(start, end)
+    bounds = [*range(start, end, _PIECE), end]
     with ThreadPoolExecutor(get_num_threads()) as threads:
         pieces = list(threads.map(lambda ends: work(*ends), pairwise(bounds)))
     return [np.concatenate(arrays) for arrays in zip(*pieces, strict=True)]

@@ -328,9 +328,10 @@ class _Window:
     def around(cls, place: np.ndarray, region: Region, params: StatisticsParams) -> "_Window | None":
         """Places (K, 2) widened by gap_mm and narrowed again, but for half the spacing of fibers: what each has to its side. The spacing
         is that of the places in the window without that margin. None without places in the region."""
-        place = place[np.hypot(*place.T) <= region.radius_mm]
-        if not len(place):
+        off = np.hypot(*place.T)
+        if not np.any(off <= region.radius_mm):
             return None
+        place = place[off <= region.radius_mm + 2 * params.gap_mm]  # a hollow at the region's rim may have its other side outside
         pixel = max(0.1 * min(params.gap_mm, 1.0), float(np.ptp(place, axis=0).max()) / _WINDOW_PX)
         rim = params.gap_mm + 3 * pixel
         low = np.floor((place.min(axis=0) - rim) / pixel) * pixel

@@ -125,7 +125,9 @@ def test_a_curve_is_no_neighbour_of_itself():
 def test_ties_and_threads_change_nothing():
     heights = np.linspace(0, 3, 31)
     where = [(x, z) for x in range(12) for z in range(12)]
-    points, offsets = flat([np.stack([np.full(31, x), heights, np.full(31, z)], axis=1) for x, z in where])  # four neighbours, equally near
+    points, offsets = flat(
+        [np.stack([np.full(31, x), heights, np.full(31, z)], axis=1) for x, z in where]
+    )  # 4464 points; four neighbours, equally near
     before = numba.get_num_threads()
     results = []
     try:

@@ -71,7 +71,7 @@ def test_lines_at_random_are_as_dense_and_as_near_as_poisson_says():
     rng = np.random.default_rng(8)
     numbers = captured(hair(uprights(rng.uniform(-7, 7, (6 * 14 * 14, 2)))), radius_mm=4.0)
     density = numbers["curves"] / (np.pi * 16)
-    assert numbers["planes"]["mean_per_mm2"] == pytest.approx(density, rel=0.03)
+    assert numbers["planes"]["mean_per_mm2"] == pytest.approx(density, rel=0.015)  # the window is a circle of the region
     assert numbers["density_at_fibers_per_mm2"]["mean"] == pytest.approx(6.0, rel=0.1)
     for name, share in (("p25", 0.25), ("median", 0.5), ("p75", 0.75)):
         assert numbers["nearest_mm"][name] == pytest.approx(np.sqrt(-np.log(1 - share) / (6 * np.pi)), rel=0.12)
