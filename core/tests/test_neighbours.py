@@ -91,6 +91,25 @@ def test_long_segments_are_as_near_as_short_ones():
     np.testing.assert_array_equal(coarse.curve[::2], dense.curve[firsts])
 
 
+def test_a_segment_is_found_where_only_its_end_comes_within_reach():
+    """Short curves ask, those of two points far apart are asked; as near as a formula says."""
+    rng = np.random.default_rng(6)
+    first, at = rng.uniform(-8, 8, (200, 3)), rng.uniform(-6, 6, (2000, 3))
+    way = rng.normal(size=(200, 3))
+    ends = np.stack([first, first + 1.2 * way / np.linalg.norm(way, axis=1, keepdims=True)], axis=1)
+    short = np.stack([at, at + 0.01 * rng.normal(size=at.shape)], axis=1)
+    is_long = np.arange(2200) < 200
+    pairs = pairs_within(*flat([*ends, *short]), 1.0, among=is_long, asking=~is_long)
+    edge, off = ends[:, 1] - ends[:, 0], short.reshape(-1, 1, 3) - ends[:, 0]
+    t = np.clip((off * edge).sum(2) / (edge**2).sum(1), 0, 1)
+    distance = np.linalg.norm(off - t[..., None] * edge, axis=2)
+    point, curve = np.nonzero(distance <= 1.0)
+    assert len(point) > 1000
+    np.testing.assert_array_equal(pairs.point - 400, point)
+    np.testing.assert_array_equal(pairs.curve, curve)
+    np.testing.assert_allclose(pairs.distance_mm, distance[point, curve], atol=1e-12)
+
+
 def test_only_curves_that_count_are_neighbours_and_only_those_that_ask_are_told():
     heights = np.linspace(0, 5, 11)
     points, offsets = flat([np.stack([np.full(11, x), heights, np.zeros(11)], axis=1) for x in (0.0, 0.1, 0.3, 0.7)])

@@ -8,7 +8,7 @@ import pytest
 
 from strandscope.core.cli import run
 from strandscope.core.errors import StrandscopeError, StrandsError
-from strandscope.core.statistics import StatisticsParams, describe, load_hair, side_by_side
+from strandscope.core.statistics import describe, load_hair, side_by_side
 from strandscope.core.statistics_page import LOOKS, plot
 from strandscope.core.strands import CAPTURED, INFILL, Strands, offsets_of, save_strands
 
@@ -166,15 +166,15 @@ def test_bundles_are_clumps_of_their_size():
 
 
 def test_fibers_are_of_one_clump_only_where_they_stay_together():
-    """Two bundles that touch over 3 of 10 mm, and a fiber across all at 40°, remain two bundles of five."""
+    """Two bundles that touch over 5.6 of some 11 mm, and a fiber across all at 40°, remain two bundles of five."""
     heights = np.arange(-5, 5.01, 0.1)
-    apart = np.clip(np.abs(heights) - 1.5, 0, 1.5)
+    apart = np.clip(np.abs(heights) - 2.8, 0, 1.5)
     left = [curve - np.outer(apart, [1, 0, 0]) for curve in uprights(bundle(5, (-0.3, 0)), heights)]
     right = [curve + np.outer(apart, [1, 0, 0]) for curve in uprights(bundle(5, (0.3, 0)), heights)]
     across = np.stack([heights * np.tan(np.radians(40)), heights, np.full(len(heights), 0.3)], axis=1)
     told = captured(hair([*left, *right, across]))["clumps"]
     np.testing.assert_allclose(told["share"], np.array([1, 0, 0, 10, 0, 0, 0]) / 11)
-    together = captured(hair([*left, *right]), inside_mm=(-1.5, 1.5), params=StatisticsParams(clump_mm=2.0))["clumps"]
+    together = captured(hair([*left, *right]), inside_mm=(-2.7, 2.7))["clumps"]
     assert together["largest"] == 10  # there they are one
 
 
