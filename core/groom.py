@@ -290,7 +290,7 @@ def _near_segments(points: np.ndarray, offsets: np.ndarray, reach_mm: float) -> 
 
 
 @njit(cache=True, nogil=True)
-def _closest(points, i, j):
+def closest(points, i, j):
     """Places s, t in 0 … 1 on the segments i and j where they come closest, and the gap (x, y, z) from j to i there."""
     dx, dy, dz = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1], points[i + 1, 2] - points[i, 2]
     ex, ey, ez = points[j + 1, 0] - points[j, 0], points[j + 1, 1] - points[j, 1], points[j + 1, 2] - points[j, 2]
@@ -309,7 +309,7 @@ def _segment_distances(points, first, second):
     """Distance (k,) mm between pairs of segments."""
     distance = np.empty(len(first))
     for k in range(len(first)):
-        _, _, x, y, z = _closest(points, first[k], second[k])
+        _, _, x, y, z = closest(points, first[k], second[k])
         distance[k] = np.sqrt(x * x + y * y + z * z)
     return distance
 
@@ -322,7 +322,7 @@ def _moves(points, first, second, per_fiber, radii, clearance, knot, weights, fi
     for k in range(len(first)):
         i, j = first[k], second[k]
         a, b = i // per_fiber, j // per_fiber
-        s, t, x, y, z = _closest(points, i, j)
+        s, t, x, y, z = closest(points, i, j)
         square, needed = x * x + y * y + z * z, radii[a] + radii[b] + clearance
         if square >= needed * needed:
             continue

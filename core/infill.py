@@ -1,390 +1,526 @@
-"""Hair that no camera sees: directions carried inwards from the captured hair, and strands along them (sec. 4.3).
+"""Hair for the inside that no camera sees, such that what was captured goes on in it.
 
-The tangents of the captured hair are averaged in voxels and extrapolated by Laplace's equation, one component at a
-time. Strands start where the hull holds more hair than was captured, follow the directions both ways to the bounds of
-the volume by the midpoint method, and are kept where they stay inside the hull. All is decided by the seed and the
-number of the strand, so the result does not depend on the number of threads.
+Three kinds of strands are added, in this order. *Links* between two captured curves that are parts of one fiber; their
+middle is hidden. *Continuations* of captured curves that end where they are hidden, to the bounds of the volume. *Whole*
+hidden fibers, as many as the density of what was captured tells to be missing. The last two run along their neighbours
+(``flow``), and depart from them as a captured hair elsewhere departs from its own; of some that a strand could be, one
+that the cameras are likely to have missed is taken (``hidden``). Then all are pushed apart (``apart``).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
-from scipy.ndimage import find_objects, gaussian_filter, maximum_filter
-from scipy.sparse import csr_array, diags_array, eye_array, kron
-from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
+from .advection import AdvectionParams, captured_density, direction_field, uniform
+from .apart import ApartParams, Tubes, push_apart
 from .errors import StrandscopeError
+from .flow import Flow, across, departures, flow, way_at
+from .hidden import hidden
 from .hull import Grid
-from .laplace import KNOWN, OUTSIDE, UNKNOWN, laplace_fill
+from .inside import occupied
+from .links import LinkParams, bridge, find_links, ways_on
 from .progress import Progress, silent
 
 
 @dataclass(frozen=True)
 class InfillParams:
-    """Parameters of the infill."""
+    """Parameters of the infill. Lengths in mm."""
 
-    count: int | None = None  # strands to add; None: as many as fill the hull as densely as the captured hair fills its own part
-    step_mm: float = 0.1  # of the advection and between points
+    method: str = "strandscope"  # or "paper": plain advection (``advection.advect``)
+    count: int | None = None  # whole hidden fibers to add; None: as many as are missing by the density of the captured ones
+    step_mm: float = 0.2  # between points
     seed: int = 0
-    min_mean_density: float = 0.8  # mean fractional density along a strand, below which it is dropped
-    density_blur_mm: float = 0.5  # standard deviation of the blur of the captured hair's density
-    full_quantile: float = 0.85  # of the captured density where there is captured hair: what counts as full
-    margin_mm: float = 2.0  # directions are solved for that far around the hull and the captured hair
-    cycles: int = 12  # V-cycles of ``laplace_fill`` at most
-    tolerance: float = 1e-5  # of a component of the direction: the largest residual at which the solver stops
-    max_failures: int = 20  # strands tried for each one wanted
-    max_diagonals: float = 6.0  # longest strand, in diagonals of the grid, so that a closed loop ends
+    tries: int = 16  # strands of which one is taken
+    flow_mm: float = 0.5  # standard deviation of the distance at which neighbours tell the way
+    hidden_mm: float = 1.0  # length over which hair is found or not as a whole
+    density_mm: float = 0.8  # standard deviation of the blur of what is still missing
+    air_mm: float = 0.4  # depth below the surface of the occupancy at which the hair itself begins
+    air_cost: float = 3.0  # a mm outside the hull, in logs of probability
+    meeting_cost: float = 6.0  # a mm that runs through a captured curve
+    least_new_mm: float = 2.0  # a whole hidden fiber that would be shorter is none
+    links: LinkParams = field(default_factory=LinkParams)
+    apart: ApartParams = field(default_factory=ApartParams)
+    advection: AdvectionParams = field(default_factory=AdvectionParams)
 
 
 class Infill(NamedTuple):
-    """M strands of N points, and how many were tried."""
+    """M strands of N points, and how they and the captured curves go on in each other."""
 
     points_mm: np.ndarray  # (N, 3) float32, object frame
     offsets: np.ndarray  # (M + 1,) int64
     radius_mm: np.ndarray  # (N,) float32
-    accepted: int
-    rejected: int  # tried, and left the hull too far, or had no direction
+    joins: np.ndarray  # (J, 2) int64: ends of one fiber; 2 c, 2 c + 1: first and last point of curve c, captured ones first
+
+
+class Captured(NamedTuple):
+    """What was captured: M curves of N points."""
+
+    points_mm: np.ndarray  # (N, 3)
+    offsets: np.ndarray  # (M + 1,)
+    radius_mm: np.ndarray  # (N,)
+    error_mm: np.ndarray  # (N,) expected
+    evidence: np.ndarray  # (N,): cameras that saw the point
+    stops: np.ndarray  # (M, 2) of Stop
 
 
 def infill(
-    points_mm: np.ndarray,
-    offsets: np.ndarray,
-    radii_mm: np.ndarray,
-    occupancy: np.ndarray,
-    grid: Grid,
-    params: InfillParams | None = None,
-    progress: Progress = silent,
+    captured: Captured, distance_mm: np.ndarray, grid: Grid, angles_deg, params: InfillParams | None = None, progress: Progress = silent
 ) -> Infill:
-    """Strands for the part of the hull that captured curves leave empty (sec. 4.3).
+    """Strands for what no camera sees. distance_mm (nx, ny, nz): of ``inside.surface_distance``; angles_deg (a,): of the sweeps.
 
-    points_mm (N, 3), offsets (M + 1,): captured curves; radii_mm: (M,) of curves or (N,) of points; occupancy
-    (nx, ny, nz), 0…1, of ``hull.occupancy``. A strand takes the mean radius of a captured curve drawn at random.
-    Raises StrandscopeError without captured curves, with an occupancy that is 0 everywhere, and for wrong shapes.
+    The same input gives the same strands, whatever the number of threads. Raises StrandscopeError without captured curves, where the
+    volume is empty, and for wrong shapes.
     """
     params = params or InfillParams()
-    points, offsets, radii = _curves(points_mm, offsets, radii_mm)
-    grid.check(occupancy, "the occupancy")
-    if not np.any(occupancy > 0.5):
-        raise StrandscopeError("infill: the occupancy is below 0.5 everywhere; expected a hull with an inside (look at the blueness threshold)")
-    progress("directions", 0, 1)
-    field = direction_field(points, offsets, grid, occupancy, params)
-    progress("directions", 1, 1)
-    captured = captured_density(points, offsets, grid)
-    missing = missing_density(captured, occupancy, grid, params)
-    wanted_mm = float(missing.sum()) * grid.voxel_mm**3
-    if params.count == 0 or (params.count is None and wanted_mm <= 0):
-        return Infill(np.empty((0, 3), np.float32), np.zeros(1, np.int64), np.empty(0, np.float32), 0, 0)
-    if not np.any(missing > 0):
-        missing = occupancy
-    return _grow_until(wanted_mm, missing, field, np.ascontiguousarray(occupancy, np.float32), radii, grid, params, progress)
+    points, offsets, radii = _checked(captured, distance_mm, grid)
+    occupancy, body = occupied(distance_mm), occupied(distance_mm - params.air_mm, params.air_mm)
+    progress("infill", 0, _STEPS)
+    field_ = direction_field(points, offsets, grid, occupancy, params.advection)
+    progress("infill", 1, _STEPS)
+    density, diameter = captured_density(points, offsets, grid), 2 * float(radii.mean())
+    unseen = hidden(density, body, diameter, grid, angles_deg, points, np.asarray(captured.evidence, float))
+    progress("infill", 2, _STEPS)
+    streams, course = _course(points, offsets, diameter, field_, unseen.found, occupancy, grid, params)
+    links, open_ends = find_links(points, offsets, captured.error_mm, captured.stops, params.links)
+    strands = [bridge(points, offsets, captured.error_mm, link, params.step_mm, params.links) for link in links]
+    ends = [link.ends for link in links] + [(int(end), -1) for end in open_ends]
+    progress("infill", 3, _STEPS)
+    ways = ways_on(points, offsets, captured.error_mm, open_ends, params.links)
+    continued = _continue(open_ends, ways, points, streams, course, params)
+    progress("infill", 4, _STEPS)
+    whole = _whole(unseen.missing, strands + continued, streams, course, grid, params)
+    progress("infill", 5, _STEPS)
+    before = [_leading(points, offsets, end) for end in open_ends] + [np.empty((0, 3))] * len(whole)
+    strands += as_smooth_as(points, offsets, continued + whole, before, params.step_mm)
+    filled = _gathered(strands, ends + [(-1, -1)] * (len(strands) - len(ends)), points, offsets, radii, params)
+    progress("infill", _STEPS, _STEPS)
+    return filled
 
 
-def _curves(points_mm, offsets, radii_mm):
-    """Contiguous arrays: points (N, 3) float64, offsets (M + 1,) int64, mean radius (M,) of each curve."""
-    points, offsets, radii = np.ascontiguousarray(points_mm, np.float64), np.ascontiguousarray(offsets, np.int64), np.asarray(radii_mm, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or offsets.ndim != 1 or len(offsets) < 2:
-        raise StrandscopeError(f"infill: no captured curves (points {points.shape}, offsets {offsets.shape}); expected at least one to follow")
-    if offsets[0] != 0 or offsets[-1] != len(points) or np.any(np.diff(offsets) < 2):
-        raise StrandscopeError(f"infill: offsets do not fit {len(points)} points; expected 0 … {len(points)}, each curve with at least 2 points")
-    if radii.shape not in ((len(points),), (len(offsets) - 1,)):
-        raise StrandscopeError(f"infill: radii have shape {radii.shape}; expected one a point ({len(points)},) or a curve ({len(offsets) - 1},)")
-    if len(radii) == len(points):
-        radii = np.add.reduceat(radii, offsets[:-1]) / np.diff(offsets)
-    return points, offsets, radii
+_STEPS = 6
 
 
-# ---- densities -------------------------------------------------------------------------------------------------------
+def _leading(points, offsets, end):
+    """The last points (n, 3) of a captured curve up to an end."""
+    first, last = offsets[end // 2], offsets[end // 2 + 1]
+    return points[max(first, last - _PAD) : last] if end % 2 else points[first : min(first + _PAD, last)][::-1]
 
 
-def captured_density(points_mm: np.ndarray, offsets: np.ndarray, grid: Grid) -> np.ndarray:
-    """Length of captured hair per volume, (nx, ny, nz) float32 in mm/mm³, which is fibers per mm² across the hair."""
-    cells, _, lengths = _pieces(points_mm, offsets, grid)
-    density = np.bincount(cells, lengths, minlength=int(np.prod(grid.shape))).reshape(grid.shape)
-    return (density / grid.voxel_mm**3).astype(np.float32)
+_PAD = 12  # points of a captured curve that tell how a strand is smoothed behind it
+_SMOOTHINGS_MM = np.array([0.0, 0.15, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3])
+_BEND_MM = 0.5  # over which curvature and its change are told
 
 
-def missing_density(captured: np.ndarray, occupancy: np.ndarray, grid: Grid, params: InfillParams | None = None) -> np.ndarray:
-    """Hair that the hull should hold and the captured curves lack, (nx, ny, nz) float32 in mm/mm³, nowhere below 0.
-
-    Full is a high quantile of the captured density inside the hull: where the cameras see well they capture nearly all.
-    """
-    params = params or InfillParams()
-    sigma = params.density_blur_mm / grid.voxel_mm
-    inside = np.asarray(occupancy, np.float32)
-    blurred = gaussian_filter(captured, sigma, mode="constant")
-    share = gaussian_filter((inside > 0.5).astype(np.float32), sigma, mode="constant")  # of the blur that lies in the hull
-    local = blurred / np.maximum(share, 0.2)
-    seen = local[(inside > 0.5) & (local > 0)]
-    full = np.quantile(seen, params.full_quantile) if len(seen) else 0.0
-    return np.maximum(full * inside - np.minimum(local, full) * (inside > 0), 0.0).astype(np.float32)
+def as_smooth_as(points: np.ndarray, offsets: np.ndarray, strands: list, before: list, step_mm: float) -> list:
+    """The strands, smoothed until they are no rougher than the curves (N, 3) are: the way that neighbours tell is rough, and what a
+    captured hair departs from it has that roughness in it too. before: the points that each strand goes on behind, or none."""
+    wanted = _roughness([points[a:b] for a, b in zip(offsets[:-1], offsets[1:], strict=True)], step_mm)
+    rough = []
+    for sigma in _SMOOTHINGS_MM:
+        smooth = [_smoothed(strand, some, sigma / step_mm) for strand, some in zip(strands, before, strict=True)]
+        rough.append(_roughness(smooth, step_mm))
+        if rough[-1] <= wanted:
+            break
+    sigma = np.interp(-wanted, -np.minimum.accumulate(rough), _SMOOTHINGS_MM[: len(rough)])
+    return [_smoothed(strand, some, sigma / step_mm) for strand, some in zip(strands, before, strict=True)]
 
 
-def _pieces(points_mm, offsets, grid):
-    """Curves cut into pieces of at most half a voxel: voxel (K,) int64, curve (K,) int64, length (K,) mm; inside only."""
-    cells, curves, lengths, _ = _cut(points_mm, offsets, np.asarray(grid.origin_mm), grid.voxel_mm, np.asarray(grid.shape))
-    return cells, curves, lengths
+def _smoothed(strand, before, sigma):
+    """A strand (n, 3) smoothed along itself, sigma in points, as the end of what is before it; its free ends keep their place."""
+    if sigma <= 0 or len(strand) < 2:
+        return strand
+    path = np.concatenate([before, strand])
+    reach = min(len(path) - 1, int(np.ceil(4 * sigma)))
+    low, high = 2 * path[0] - path[reach:0:-1], 2 * path[-1] - path[-2 : -reach - 2 : -1]
+    return gaussian_filter1d(np.concatenate([low, path, high]), sigma, axis=0)[reach + len(before) : reach + len(path)]
+
+
+def _roughness(curves, step_mm):
+    """Mean change of the curvature vector (1/mm²) along curves of points a step apart, over _BEND_MM."""
+    k, total, count = max(round(_BEND_MM / step_mm), 1), 0.0, 0
+    for curve in curves:
+        if len(curve) > 3 * k:
+            change = curve[3 * k :] - 3 * curve[2 * k : -k] + 3 * curve[k : -2 * k] - curve[: -3 * k]
+            total += float(np.sum(np.linalg.norm(change, axis=1))) / (k * step_mm) ** 3
+            count += len(change)
+    return total / max(count, 1)
+
+
+def _checked(captured, distance_mm, grid):
+    """Contiguous points (N, 3) float64, offsets (M + 1,) int64, mean radius (M,) of each curve."""
+    points, offsets = np.ascontiguousarray(captured.points_mm, np.float64), np.ascontiguousarray(captured.offsets, np.int64)
+    if points.ndim != 2 or points.shape[1:] != (3,) or len(offsets) < 2 or offsets[-1] != len(points) or np.any(np.diff(offsets) < 2):
+        raise StrandscopeError(
+            f"infill: no captured curves (points {points.shape}, offsets {offsets.shape}); expected some, of 2 points or more each"
+        )
+    for name, values, shape in (
+        ("radius_mm", captured.radius_mm, (len(points),)),
+        ("error_mm", captured.error_mm, (len(points),)),
+        ("evidence", captured.evidence, (len(points),)),
+        ("stops", captured.stops, (len(offsets) - 1, 2)),
+    ):
+        if np.shape(values) != shape:
+            raise StrandscopeError(f"infill: {name} has shape {np.shape(values)}; expected {shape}")
+    if not np.any(grid.check(distance_mm, "the distance to the surface") > 0):
+        raise StrandscopeError("infill: no voxel lies inside the hair; expected a hull with an inside (look at the blueness threshold)")
+    return points, offsets, np.add.reduceat(np.asarray(captured.radius_mm, np.float64), offsets[:-1]) / np.diff(offsets)
+
+
+# ---- one strand ------------------------------------------------------------------------------------------------------
+
+
+class _Course(NamedTuple):
+    """All that the way of a strand depends on."""
+
+    departures: np.ndarray  # (N, 2) of the captured curves
+    offsets: np.ndarray  # (M + 1,)
+    cost: np.ndarray  # (nx, ny, nz) float32: -log of how probable it is that a mm of hair there was not found
+    origin: np.ndarray  # (3,) mm, of the voxels
+    voxel_mm: float
+    reach_mm: float  # radius of the captured volume about the axis
+    bottom_mm: float
+    top_mm: float
+    step_mm: float
+    apart_mm: float  # distance from a captured curve from which on a strand does not meet it
+    meeting_cost: float
+    typical_mm: float  # length of a whole fiber
+    seed: int
+
+
+_LOOK_BACK = 3  # points before an end at which a departure is compared too
+_DONORS = 48  # captured places that are compared
+_LEAST_LEFT = 10  # points that a donor has ahead
+_FADE_MM = 1.0  # by which what a donor departs differently fades
+
+
+def _course(points, offsets, diameter, field_, found, occupancy, grid, params) -> tuple[Flow, _Course]:
+    streams = flow(points, offsets, params.flow_mm, field_, grid.origin_mm, grid.voxel_mm)
+    cost = -np.log(np.maximum(1.0 - found, 1e-3)) / params.hidden_mm
+    cost += params.air_cost * np.clip(1.0 - 2.0 * occupancy, 0.0, 1.0)
+    low, high = np.asarray(grid.origin_mm), grid.high_mm
+    reach = float(min(-low[0], high[0], -low[2], high[2]))
+    return streams, _Course(
+        departures(streams, points, offsets),
+        offsets,
+        np.ascontiguousarray(cost, np.float32),
+        low.astype(float),
+        grid.voxel_mm,
+        max(reach, grid.voxel_mm),
+        float(low[1]),
+        float(high[1]),
+        params.step_mm,
+        diameter,
+        params.meeting_cost,
+        float(high[1] - low[1]),
+        params.seed,
+    )
 
 
 @njit(cache=True, nogil=True)
-def _cut(points, offsets, origin, voxel, shape):
-    total = 0
-    for c in range(len(offsets) - 1):
-        for n in range(offsets[c], offsets[c + 1] - 1):
-            total += max(1, int(np.ceil(np.sqrt(np.sum((points[n + 1] - points[n]) ** 2)) / (0.5 * voxel))))
-    cells, curves = np.empty(total, np.int64), np.empty(total, np.int64)
-    lengths, tangents = np.empty(total), np.empty((total, 3))
-    found = 0
-    for c in range(len(offsets) - 1):
-        for n in range(offsets[c], offsets[c + 1] - 1):
-            edge = points[n + 1] - points[n]
-            length = np.sqrt(np.sum(edge**2))
-            if length == 0.0:
+def _donor(course, number, turn, a, b, back_a, back_b, first):
+    """A place of a captured curve whose departures are like (a, b) here and (back_a, back_b) some points back, once turned about the way:
+    its point, +1 or -1 for the way along its curve, and cosine and sine of the turn. first: nothing is to be matched."""
+    best, at, way, cos, sin = np.inf, -1, 1, 1.0, 0.0
+    total = course.offsets[-1]
+    for n in range(_DONORS):
+        point = min(int(uniform(course.seed, number, 8 * (turn * _DONORS + n) + 1) * total), total - 1)
+        curve = np.searchsorted(course.offsets, point, side="right") - 1
+        step = 1 if uniform(course.seed, number, 8 * (turn * _DONORS + n) + 2) < 0.5 else -1
+        ahead = course.offsets[curve + 1] - 1 - point if step > 0 else point - course.offsets[curve]
+        behind = point - course.offsets[curve] if step > 0 else course.offsets[curve + 1] - 1 - point
+        if ahead < _LEAST_LEFT or behind < _LOOK_BACK:
+            continue
+        angle = 2 * np.pi * uniform(course.seed, number, 8 * (turn * _DONORS + n) + 3)
+        if first:
+            return point, step, np.cos(angle), np.sin(angle)
+        p, q = course.departures[point]
+        p2, q2 = course.departures[point - step * _LOOK_BACK]
+        if step < 0:
+            p, p2 = -p, -p2  # the way turns round, and one axis across it with it
+        cross, dot = p * b - q * a + p2 * back_b - q2 * back_a, p * a + q * b + p2 * back_a + q2 * back_b
+        length = np.sqrt(cross * cross + dot * dot)
+        c, s = (dot / length, cross / length) if length > 1e-12 else (np.cos(angle), np.sin(angle))
+        miss = (c * p - s * q - a) ** 2 + (s * p + c * q - b) ** 2 + (c * p2 - s * q2 - back_a) ** 2 + (s * p2 + c * q2 - back_b) ** 2
+        if miss < best:
+            best, at, way, cos, sin = miss, point, step, c, s
+    return at, way, cos, sin
+
+
+@njit(cache=True, nogil=True)
+def _inside(course, x, y, z):
+    return x * x + z * z <= course.reach_mm**2 and course.bottom_mm <= y <= course.top_mm
+
+
+@njit(cache=True, nogil=True)
+def _cost_at(course, x, y, z):
+    nx, ny, nz = course.cost.shape
+    i = min(max(int((x - course.origin[0]) / course.voxel_mm), 0), nx - 1)
+    j = min(max(int((y - course.origin[1]) / course.voxel_mm), 0), ny - 1)
+    k = min(max(int((z - course.origin[2]) / course.voxel_mm), 0), nz - 1)
+    return course.cost[i, j, k]
+
+
+@njit(cache=True, nogil=True)
+def _run(streams, course, number, own, x, y, z, tx, ty, tz, known, back, out):
+    """Points of a strand on from (x, y, z) that runs as (tx, ty, tz), into out (n, 3): how many, and what they cost.
+
+    known: whether the strand goes on from a curve, which then departs there from its neighbours as its direction tells, and departed by
+    ``back`` (2,) some points before, in axes of the way there.
+    """
+    fx, fy, fz, _ = way_at(streams, x, y, z, tx, ty, tz, own)
+    ax, ay, az = across(fx, fy, fz, 1.0, 0.0, 0.0)
+    bx, by, bz = fy * az - fz * ay, fz * ax - fx * az, fx * ay - fy * ax
+    a, b = tx * ax + ty * ay + tz * az, tx * bx + ty * by + tz * bz
+    turns = 0
+    at, way, cos, sin = _donor(course, number, turns, a, b, back[0], back[1], not known)
+    if at < 0:
+        at, way, cos, sin = 0, 1, 0.0, 0.0  # no curve is long enough to tell: none departs
+    p, q = course.departures[at]
+    if way < 0:
+        p = -p
+    off_a, off_b = (a - (cos * p - sin * q), b - (sin * p + cos * q)) if known else (0.0, 0.0)
+    fade = np.exp(-course.step_mm / _FADE_MM)
+    cost = 0.0
+    last_a, last_b = np.zeros(_LOOK_BACK + 1), np.zeros(_LOOK_BACK + 1)
+    for n in range(len(out)):
+        curve = np.searchsorted(course.offsets, at, side="right") - 1
+        onward = at + way
+        if onward < course.offsets[curve] or onward >= course.offsets[curve + 1]:
+            turns += 1
+            old = n - 1 - _LOOK_BACK
+            was = (last_a[old % (_LOOK_BACK + 1)], last_b[old % (_LOOK_BACK + 1)]) if old >= 0 else (a, b)
+            found, way2, cos2, sin2 = _donor(course, number, turns, a, b, was[0], was[1], False)
+            if found >= 0:
+                at, way, cos, sin = found, way2, cos2, sin2
+                p, q = course.departures[at]
+                if way < 0:
+                    p = -p
+                off_a, off_b = a - (cos * p - sin * q), b - (sin * p + cos * q)
+                onward = at + way
+            else:
+                onward = at
+        at = onward
+        p, q = course.departures[at]
+        if way < 0:
+            p = -p
+        off_a *= fade
+        off_b *= fade
+        next_a, next_b = cos * p - sin * q + off_a, sin * p + cos * q + off_b
+        half_a, half_b = 0.5 * (a + next_a), 0.5 * (b + next_b)
+        along = np.sqrt(max(1.0 - half_a * half_a - half_b * half_b, 0.04))
+        dx, dy, dz = along * fx + half_a * ax + half_b * bx, along * fy + half_a * ay + half_b * by, along * fz + half_a * az + half_b * bz
+        mx, my, mz = x + 0.5 * course.step_mm * dx, y + 0.5 * course.step_mm * dy, z + 0.5 * course.step_mm * dz
+        fx, fy, fz, square = way_at(streams, mx, my, mz, dx, dy, dz, own)
+        ax, ay, az = across(fx, fy, fz, ax, ay, az)
+        bx, by, bz = fy * az - fz * ay, fz * ax - fx * az, fx * ay - fy * ax
+        dx, dy, dz = along * fx + half_a * ax + half_b * bx, along * fy + half_a * ay + half_b * by, along * fz + half_a * az + half_b * bz
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        x, y, z = x + course.step_mm * dx / length, y + course.step_mm * dy / length, z + course.step_mm * dz / length
+        a, b = next_a, next_b
+        last_a[n % (_LOOK_BACK + 1)], last_b[n % (_LOOK_BACK + 1)] = a, b
+        if not _inside(course, x, y, z):
+            return n, cost
+        out[n, 0], out[n, 1], out[n, 2] = x, y, z
+        cost += course.step_mm * _cost_at(course, x, y, z)
+        if square < course.apart_mm**2:
+            cost += course.step_mm * course.meeting_cost * (1.0 - np.sqrt(square) / course.apart_mm)
+    return len(out), cost
+
+
+# ---- continuations ---------------------------------------------------------------------------------------------------
+
+
+def _continue(open_ends, ways, points, streams, course, params):
+    """Strands (n, 3) on from each open end; n may be 0."""
+    ends = np.asarray(open_ends, np.int64)
+    longest = int(np.ceil(4 * (2 * course.reach_mm + course.top_mm - course.bottom_mm) / course.step_mm))
+    out = np.zeros((len(ends), longest, 3), np.float32)
+    sizes = np.zeros(len(ends), np.int64)
+    _continue_all(streams, course, ends, ways, points, params.tries, out, sizes)
+    return [out[n, : sizes[n]].astype(np.float64) for n in range(len(ends))]
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _continue_all(streams, course, ends, ways, points, tries, out, sizes):
+    for n in prange(len(ends)):
+        curve, side = ends[n] // 2, ends[n] % 2
+        first, last = course.offsets[curve], course.offsets[curve + 1]
+        size = min(last - first, 2 * _LOOK_BACK + 1)
+        before = np.empty((size, 3))
+        for m in range(size):
+            before[m] = points[last - size + m] if side == 1 else points[first + size - 1 - m]
+        best = np.inf
+        room = np.zeros((out.shape[1], 3))
+        for k in range(tries):
+            number = ends[n] * tries + k
+            size, cost = _go_on(streams, course, number, curve, before, ways[n], room)
+            cost += np.log(-np.log(uniform(course.seed, number, 0) + 1e-12) + 1e-12)  # Gumbel's: one is drawn by its probability
+            if cost < best:
+                best = cost
+                sizes[n] = size
+                out[n, :size] = room[:size]
+
+
+@njit(cache=True, nogil=True)
+def _go_on(streams, course, number, own, before, way, out):
+    """Points of a strand that goes on the unit direction ``way`` (3,) behind the last of ``before`` (k, 3), into out (n, 3): how many, and
+    what they cost."""
+    last = len(before) - 1
+    reach = min(_LOOK_BACK, last)
+    tip, behind, further = before[last], before[last - reach], before[max(last - 2 * reach, 0)]
+    tx, ty, tz = way
+    back = np.zeros(2)
+    bx, by, bz = behind[0] - further[0], behind[1] - further[1], behind[2] - further[2]
+    length = np.sqrt(bx * bx + by * by + bz * bz)
+    if length > 1e-9:
+        fx, fy, fz, _ = way_at(streams, behind[0], behind[1], behind[2], tx, ty, tz, own)
+        ax, ay, az = across(fx, fy, fz, 1.0, 0.0, 0.0)
+        back[0] = (bx * ax + by * ay + bz * az) / length
+        back[1] = (bx * (fy * az - fz * ay) + by * (fz * ax - fx * az) + bz * (fx * ay - fy * ax)) / length
+    return _run(streams, course, number, own, tip[0], tip[1], tip[2], tx, ty, tz, True, back, out)
+
+
+# ---- whole fibers ----------------------------------------------------------------------------------------------------
+
+_PARTS = 6  # in which whole fibers are added; each sees what those before have filled
+
+
+def _whole(missing, strands, streams, course, grid, params):
+    """Strands (n, 3) for whole fibers that were not found, from bound to bound of the volume, where hair is still missing."""
+    sigma, whole, by_count = params.density_mm / grid.voxel_mm, [], params.count is not None
+    longest = int(np.ceil(4 * (2 * course.reach_mm + course.top_mm - course.bottom_mm) / course.step_mm))
+    left = missing - gaussian_filter(_density_of(strands, grid), sigma, mode="constant")
+    for part in range(_PARTS):
+        wanted = ((params.count - len(whole)) if by_count else float(left.sum()) * grid.voxel_mm**3) / (_PARTS - part)
+        if wanted <= 0:
+            break
+        cells = np.flatnonzero(left.ravel() > 0) if np.any(left > 0) else np.arange(left.size)
+        weights = np.cumsum(np.maximum(left.ravel()[cells], 1e-6), dtype=np.float64)
+        more = _some_whole(wanted, by_count, len(whole), cells, weights, longest, streams, course, grid, params)
+        whole += more
+        left = left - gaussian_filter(_density_of(more, grid), sigma, mode="constant")
+    return whole
+
+
+def _density_of(strands, grid):
+    sizes = [len(strand) for strand in strands]
+    if not sum(sizes):
+        return np.zeros(grid.shape, np.float32)
+    return captured_density(np.concatenate(strands), np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64), grid)
+
+
+def _some_whole(wanted, by_count, before, cells, weights, longest, streams, course, grid, params):
+    """Whole fibers until ``wanted`` of them, or of mm, are there."""
+    whole, done = [], 0.0
+    guess = int(np.ceil(wanted)) if by_count else int(np.ceil(wanted / max(course.top_mm - course.bottom_mm, 1e-6)))
+    for turn in range(8):
+        size = max(guess - len(whole), 1)
+        first = _WHOLE + (before + len(whole)) * params.tries + turn * 1_000_003
+        out, sizes = np.zeros((size, 2 * longest, 3)), np.zeros(size, np.int64)
+        _try_whole(streams, course, first, cells, weights, np.asarray(grid.shape), params.tries, out, sizes)
+        for strand, length in zip(out, sizes, strict=True):
+            if length * course.step_mm < params.least_new_mm:
                 continue
-            parts = max(1, int(np.ceil(length / (0.5 * voxel))))
-            for part in range(parts):
-                place = (points[n] + edge * ((part + 0.5) / parts) - origin) / voxel
-                i, j, k = int(np.floor(place[0])), int(np.floor(place[1])), int(np.floor(place[2]))
-                if 0 <= i < shape[0] and 0 <= j < shape[1] and 0 <= k < shape[2]:
-                    cells[found] = (i * shape[1] + j) * shape[2] + k
-                    curves[found] = c
-                    lengths[found] = length / parts
-                    tangents[found] = edge / length
-                    found += 1
-    return cells[:found], curves[:found], lengths[:found], tangents[:found]
+            gain = 1.0 if by_count else length * course.step_mm
+            if done + (0.5 * gain if not by_count else 0.0) >= wanted:
+                return whole
+            whole.append(strand[:length].copy())
+            done += gain
+    return whole
 
 
-# ---- directions ------------------------------------------------------------------------------------------------------
+_WHOLE = 1_000_000_007  # from this number on, draws are those of whole fibers
 
 
-def direction_field(
-    points_mm: np.ndarray, offsets: np.ndarray, grid: Grid, occupancy: np.ndarray | None = None, params: InfillParams | None = None
-) -> np.ndarray:
-    """Directions (nx, ny, nz, 3) float32: average tangents of captured curves, extrapolated into empty voxels (sec. 4.3).
+@njit(cache=True, nogil=True, parallel=True)
+def _try_whole(streams, course, first, cells, weights, shape, tries, out, sizes):
+    for n in prange(len(out)):
+        best = np.inf
+        room = np.zeros((out.shape[1], 3))
+        nothing = np.zeros(2)
+        for k in range(tries):
+            number = first + n * tries + k
+            index = min(np.searchsorted(weights, uniform(course.seed, number, 11) * weights[-1], side="right"), len(cells) - 1)
+            cell = cells[index]
+            i, j, k3 = cell // (shape[1] * shape[2]), cell // shape[2] % shape[1], cell % shape[2]
+            x = course.origin[0] + (i + uniform(course.seed, number, 12)) * course.voxel_mm
+            y = course.origin[1] + (j + uniform(course.seed, number, 13)) * course.voxel_mm
+            z = course.origin[2] + (k3 + uniform(course.seed, number, 14)) * course.voxel_mm
+            if not _inside(course, x, y, z):
+                continue
+            tx, ty, tz = _field_at(streams, x, y, z)
+            half = out.shape[1] // 2
+            ahead, cost = _run(streams, course, number, -1, x, y, z, tx, ty, tz, False, nothing, room[:half])
+            if ahead < 2 * _LOOK_BACK + 1:
+                continue
+            before = np.empty((2 * _LOOK_BACK + 1, 3))
+            before[2 * _LOOK_BACK, 0], before[2 * _LOOK_BACK, 1], before[2 * _LOOK_BACK, 2] = x, y, z
+            for m in range(2 * _LOOK_BACK):
+                before[m] = room[2 * _LOOK_BACK - 1 - m]
+            way = before[2 * _LOOK_BACK] - before[_LOOK_BACK]
+            way /= np.sqrt(np.sum(way * way))
+            behind, more = _go_on(streams, course, number + 500_000_003, -1, before, way, room[half:])
+            size = ahead + behind + 1
+            cost = (cost + more) / (size * course.step_mm) * course.typical_mm
+            cost += np.log(-np.log(uniform(course.seed, number, 0) + 1e-12) + 1e-12)
+            if cost < best and size > 1:
+                best = cost
+                sizes[n] = size
+                for m in range(behind):
+                    out[n, m] = room[half + behind - 1 - m]
+                out[n, behind, 0], out[n, behind, 1], out[n, behind, 2] = x, y, z
+                for m in range(ahead):
+                    out[n, behind + 1 + m] = room[m]
 
-    A voxel with hair gets the main direction of its tangents (the first eigenvector of Σ t tᵀ, for which a hair has
-    neither head nor tail), headed as most of its curves are once these agree with their neighbours; it has length 1. The
-    others are solved for, within margin_mm of the hair and of the hull (0 beyond); where sides disagree they are shorter.
-    """
-    params = params or InfillParams()
-    points, offsets = np.ascontiguousarray(points_mm, np.float64), np.ascontiguousarray(offsets, np.int64)
-    cells, curves, lengths, tangents = _cut(points, offsets, np.asarray(grid.origin_mm), grid.voxel_mm, np.asarray(grid.shape))
-    if not len(cells):
-        raise StrandscopeError("infill: no captured curve runs through the volume; expected some to take directions from")
-    headed = tangents * curve_signs(points, offsets, grid)[curves][:, None]
-    places, index = np.unique(cells, return_inverse=True)
-    field = np.zeros((*grid.shape, 3), np.float32)
-    field.reshape(-1, 3)[places] = _main_directions(index, len(places), headed, lengths)
-    kinds = np.full(grid.shape, UNKNOWN, np.uint8)
-    kinds.ravel()[places] = KNOWN
-    near = kinds == KNOWN
-    if occupancy is not None:
-        near |= grid.check(occupancy, "the occupancy") > 0.0
-    kinds[maximum_filter(near, 2 * int(np.ceil(params.margin_mm / grid.voxel_mm)) + 1) == 0] = OUTSIDE
-    box = find_objects((kinds != OUTSIDE).view(np.int8))[0]
-    field[box] = laplace_fill(field[box], kinds[box], params.cycles, params.tolerance)
-    return field
+
+@njit(cache=True, nogil=True)
+def _field_at(streams, x, y, z):
+    nx, ny, nz, _ = streams.field.shape
+    i = min(max(int((x - streams.origin[0]) / streams.voxel_mm), 0), nx - 1)
+    j = min(max(int((y - streams.origin[1]) / streams.voxel_mm), 0), ny - 1)
+    k = min(max(int((z - streams.origin[2]) / streams.voxel_mm), 0), nz - 1)
+    vector = streams.field[i, j, k]
+    length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    if length < 1e-6:
+        return 0.0, -1.0, 0.0
+    return vector[0] / length, vector[1] / length, vector[2] / length
 
 
-def _main_directions(index, count, tangents, lengths):
-    """First eigenvector of Σ t tᵀ of the tangents (K, 3) in each of count voxels, headed as Σ t. index (K,) -> (count, 3)."""
-    tensors, sums = np.empty((count, 3, 3)), np.empty((count, 3))
-    for a in range(3):
-        sums[:, a] = np.bincount(index, lengths * tangents[:, a], count)
-        for b in range(a, 3):
-            tensors[:, a, b] = tensors[:, b, a] = np.bincount(index, lengths * tangents[:, a] * tangents[:, b], count)
-    main = np.linalg.eigh(tensors)[1][:, :, 2]
-    return main * np.where(np.sum(main * sums, axis=1) < 0, -1.0, 1.0)[:, None]
+# ---- together --------------------------------------------------------------------------------------------------------
 
 
-def curve_signs(points_mm: np.ndarray, offsets: np.ndarray, grid: Grid, reach_mm: float = 1.0) -> np.ndarray:
-    """+1 or −1 (M,) for each curve, so that neighbouring curves run the same way, and all of them on the whole down, −y.
-
-    Along a curve the heading is sure, also through curls; only whole curves are turned. Two curves are compared by the
-    sum of products of their tangents where they pass the same cell of reach_mm, or at half weight cells that share a
-    face. The surest comparisons decide first: a spanning tree of the largest sums carries the heading on.
-    """
-    points, offsets = np.ascontiguousarray(points_mm, np.float64), np.ascontiguousarray(offsets, np.int64)
-    coarse = Grid.around(grid.origin_mm, grid.high_mm, max(reach_mm, grid.voxel_mm))
-    cells, curves, lengths, tangents = _cut(points, offsets, np.asarray(coarse.origin_mm), coarse.voxel_mm, np.asarray(coarse.shape))
+def _gathered(strands, from_ends, points, offsets, radii, params) -> Infill:
+    """The strands pushed apart, without those of no points, and their joins."""
     count = len(offsets) - 1
-    columns = (3 * cells[:, None] + np.arange(3)).ravel()
-    passed = csr_array(((lengths[:, None] * tangents).ravel(), (np.repeat(curves, 3), columns)), (count, 3 * int(np.prod(coarse.shape))))
-    alike = (passed @ _touching(coarse.shape) @ passed.T).tocsr()
-    alike.eliminate_zeros()
-    tree = alike.copy()
-    tree.data = -np.abs(tree.data)
-    tree = minimum_spanning_tree(tree)
-    signs = np.ones(count)
-    rises = points[offsets[1:] - 1, 1] - points[offsets[:-1], 1]
-    _, groups = connected_components(tree, directed=False)
-    for first in np.unique(groups, return_index=True)[1]:
-        order, parents = breadth_first_order(tree, first, directed=False)
-        for curve in order[1:]:
-            signs[curve] = signs[parents[curve]] * np.sign(alike[curve, parents[curve]])
-        if np.sum(signs[order] * rises[order]) > 0:
-            signs[order] *= -1
-    return signs
+    keep = [k for k, strand in enumerate(strands) if len(strand) >= 2]
+    strands, from_ends = [strands[k] for k in keep], [from_ends[k] for k in keep]
+    radius = np.array([_radius(ends, radii, params.seed, k) for k, ends in enumerate(from_ends)])
+    sizes = np.array([len(strand) for strand in strands], np.int64)
+    starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    together = np.concatenate(strands) if strands else np.empty((0, 3))
+    joins = np.array(
+        [(end, 2 * (count + k) + side) for k, ends in enumerate(from_ends) for side, end in enumerate(ends) if end >= 0], np.int64
+    ).reshape(-1, 2)
+    fiber = _fibers(joins, count + len(strands))
+    moving, still = Tubes(together, starts, radius, fiber[count:]), Tubes(points, offsets, radii, fiber[:count])
+    held = np.array([[end >= 0 for end in ends] for ends in from_ends], bool).reshape(-1, 2)
+    together = push_apart(moving, still, held, params.apart)
+    return Infill(together.astype(np.float32), starts, np.repeat(radius, sizes).astype(np.float32), joins)
 
 
-def _touching(shape):
-    """Sparse (3 n, 3 n) of the n cells' three components: 1 for a cell itself, ½ for those that share a face with it."""
-    lines = [diags_array([np.full(max(n - 1, 0), 0.5)] * 2, offsets=[-1, 1], shape=(n, n)) for n in shape]
-    ones = [eye_array(n) for n in shape]
-    faces = sum(kron(kron(lines[a] if a == 0 else ones[0], lines[1] if a == 1 else ones[1]), lines[2] if a == 2 else ones[2]) for a in range(3))
-    return kron(faces + eye_array(int(np.prod(shape))), eye_array(3)).tocsr()
+def _fibers(joins, count):
+    """The number of the fiber (count,) of each curve: of those that are joined, one."""
+    pieces = joins // 2
+    graph = coo_array((np.ones(len(pieces)), pieces.T), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
-# ---- advection -------------------------------------------------------------------------------------------------------
-
-
-def _grow_until(wanted_mm, density, field, occupancy, radii, grid, params, progress) -> Infill:
-    """Try strands, a batch at a time, until enough (count, else wanted_mm of length) are accepted or the tries are used up."""
-    by_count = params.count is not None
-    wanted = float(params.count) if by_count else wanted_mm
-    diagonal_mm = float(np.linalg.norm(grid.high_mm - grid.origin_mm))
-    guess = int(np.ceil(wanted if by_count else wanted / diagonal_mm))
-    flat = np.flatnonzero(density > 0)
-    sampling = params.seed, flat, np.cumsum(density.ravel()[flat], dtype=np.float64), np.asarray(grid.shape)
-    most_steps = max(int(params.max_diagonals * diagonal_mm / params.step_mm), 2)
-    course = field, np.asarray(grid.origin_mm), grid.voxel_mm, params.step_mm, most_steps
-    numbers, sizes, done, tried = [np.empty(0, np.int64)], [np.empty((0, 2), np.int64)], 0.0, 0
-    while done < wanted and tried < guess * params.max_failures:
-        batch = np.arange(tried, tried + max(guess // 2, 64))
-        steps, mean = _try(batch, *sampling, *course, occupancy)
-        good = (mean >= params.min_mean_density) & (steps.sum(axis=1) > 0)
-        gain = np.cumsum(np.where(good, 1.0 if by_count else steps.sum(axis=1) * params.step_mm, 0.0))
-        used = min(int(np.searchsorted(gain, wanted - done)) + 1, len(batch))
-        numbers.append(batch[:used][good[:used]])
-        sizes.append(steps[:used][good[:used]])
-        done += float(gain[used - 1])
-        tried += used
-        progress("infill", min(done, wanted), wanted)
-    numbers, sizes = np.concatenate(numbers), np.concatenate(sizes)
-    offsets = np.concatenate([[0], np.cumsum(sizes.sum(axis=1) + 1)]).astype(np.int64)
-    points = np.empty((offsets[-1], 3), np.float32)
-    _write(numbers, *sampling, *course, sizes, offsets, points)
-    chosen = radii[_draw(params.seed, numbers, len(radii))]
-    return Infill(points, offsets, np.repeat(chosen, np.diff(offsets)).astype(np.float32), len(numbers), tried - len(numbers))
-
-
-@njit(cache=True, nogil=True)
-def _uniform(seed, number, which):
-    """A number of [0, 1) for the which-th draw of a strand: splitmix64 of seed, strand and draw."""
-    state = np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(number) * np.uint64(0xD1B54A32D192ED03) + np.uint64(which + 1)
-    for _ in range(2):
-        state += np.uint64(0x9E3779B97F4A7C15)
-        state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        state ^= state >> np.uint64(31)
-    return (state >> np.uint64(11)) * (1.0 / 9007199254740992.0)
-
-
-@njit(cache=True, nogil=True)
-def _draw(seed, numbers, size):
-    """For each strand one of 0 … size − 1."""
-    return np.array([int(_uniform(seed, number, 4) * size) for number in numbers], np.int64)
-
-
-@njit(cache=True, nogil=True)
-def _start_of(number, seed, flat, cumulative, shape):
-    """Where strand ``number`` starts, (3,) in cell units: a voxel by its density, a place in it evenly."""
-    index = min(np.searchsorted(cumulative, _uniform(seed, number, 0) * cumulative[-1], side="right"), len(flat) - 1)
-    cell = flat[index]
-    i, j, k = cell // (shape[1] * shape[2]), cell // shape[2] % shape[1], cell % shape[2]
-    return i + _uniform(seed, number, 1), j + _uniform(seed, number, 2), k + _uniform(seed, number, 3)
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _try(numbers, seed, flat, cumulative, shape, field, origin, voxel, step_mm, most_steps, occupancy):
-    """Steps ahead and behind (n, 2) and the mean density along each strand (n,)."""
-    steps, mean = np.zeros((len(numbers), 2), np.int64), np.zeros(len(numbers))
-    nothing = np.empty((0, 3), np.float32)
-    for n in prange(len(numbers)):
-        x, y, z = _start_of(numbers[n], seed, flat, cumulative, shape)
-        total = _sample(occupancy, x, y, z)
-        for side in range(2):
-            steps[n, side], passed = _follow(x, y, z, 1.0 - 2.0 * side, field, occupancy, step_mm / voxel, most_steps, nothing, 0, 0, origin, voxel)
-            total += passed
-        mean[n] = total / (1 + steps[n, 0] + steps[n, 1])
-    return steps, mean
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _write(numbers, seed, flat, cumulative, shape, field, origin, voxel, step_mm, most_steps, steps, offsets, points):
-    no_density = np.zeros((1, 1, 1), np.float32)
-    for n in prange(len(numbers)):
-        x, y, z = _start_of(numbers[n], seed, flat, cumulative, shape)
-        middle = offsets[n] + steps[n, 1]
-        points[middle, 0], points[middle, 1], points[middle, 2] = origin[0] + x * voxel, origin[1] + y * voxel, origin[2] + z * voxel
-        _follow(x, y, z, 1.0, field, no_density, step_mm / voxel, most_steps, points, middle, 1, origin, voxel)
-        _follow(x, y, z, -1.0, field, no_density, step_mm / voxel, most_steps, points, middle, -1, origin, voxel)
-
-
-@njit(cache=True, nogil=True)
-def _follow(x, y, z, heading, field, density, step, most_steps, points, at, stride, origin, voxel):
-    """Midpoint steps from (x, y, z) in cell units until the next leaves the grid or has no direction.
-
-    Returns their number and the sum of densities where they end; with a stride, each end is written to points, in mm.
-    """
-    nx, ny, nz, _ = field.shape
-    i, j, k = int(x), int(y), int(z)
-    tx, ty, tz = heading * field[i, j, k, 0], heading * field[i, j, k, 1], heading * field[i, j, k, 2]
-    total = 0.0
-    for count in range(most_steps):
-        tx, ty, tz, sure = _direction(field, x, y, z, tx, ty, tz)
-        if not sure:
-            return count, total
-        tx, ty, tz, sure = _direction(field, x + 0.5 * step * tx, y + 0.5 * step * ty, z + 0.5 * step * tz, tx, ty, tz)
-        if not sure:
-            return count, total
-        x, y, z = x + step * tx, y + step * ty, z + step * tz
-        if not (0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz):
-            return count, total
-        total += _sample(density, x, y, z)
-        if stride != 0:
-            at += stride
-            points[at, 0], points[at, 1], points[at, 2] = origin[0] + x * voxel, origin[1] + y * voxel, origin[2] + z * voxel
-    return most_steps, total
-
-
-@njit(cache=True, nogil=True)
-def _corner(x, size):
-    """The two cells whose centres lie around x, and the share of the second; beyond the outer centres the outer cell."""
-    low = min(max(int(np.floor(x - 0.5)), 0), size - 1)
-    return low, min(low + 1, size - 1), min(max(x - 0.5 - low, 0.0), 1.0)
-
-
-@njit(cache=True, nogil=True)
-def _direction(field, x, y, z, tx, ty, tz):
-    """Unit direction at (x, y, z), trilinear, each of the eight turned to go with (tx, ty, tz) first; and whether there is one."""
-    nx, ny, nz, _ = field.shape
-    i0, i1, a = _corner(x, nx)
-    j0, j1, b = _corner(y, ny)
-    k0, k1, c = _corner(z, nz)
-    sx, sy, sz = 0.0, 0.0, 0.0
-    for corner in range(8):
-        vector = field[i1 if corner & 4 else i0, j1 if corner & 2 else j0, k1 if corner & 1 else k0]
-        weight = (a if corner & 4 else 1.0 - a) * (b if corner & 2 else 1.0 - b) * (c if corner & 1 else 1.0 - c)
-        if vector[0] * tx + vector[1] * ty + vector[2] * tz < 0.0:
-            weight = -weight
-        sx += weight * vector[0]
-        sy += weight * vector[1]
-        sz += weight * vector[2]
-    size = np.sqrt(sx * sx + sy * sy + sz * sz)
-    if size < 1e-6:
-        return tx, ty, tz, False
-    return sx / size, sy / size, sz / size, True
-
-
-@njit(cache=True, nogil=True)
-def _sample(volume, x, y, z):
-    """Trilinear value of a volume (nx, ny, nz) at (x, y, z) in cell units."""
-    nx, ny, nz = volume.shape
-    i0, i1, a = _corner(x, nx)
-    j0, j1, b = _corner(y, ny)
-    k0, k1, c = _corner(z, nz)
-    near = (volume[i0, j0, k0] * (1 - c) + volume[i0, j0, k1] * c) * (1 - b) + (volume[i0, j1, k0] * (1 - c) + volume[i0, j1, k1] * c) * b
-    far = (volume[i1, j0, k0] * (1 - c) + volume[i1, j0, k1] * c) * (1 - b) + (volume[i1, j1, k0] * (1 - c) + volume[i1, j1, k1] * c) * b
-    return near * (1 - a) + far * a
+def _radius(ends, radii, seed, number):
+    """That of the fiber which it belongs to, else of a captured one drawn at random."""
+    known = [radii[end // 2] for end in ends if end >= 0]
+    return float(np.mean(known)) if known else float(radii[min(int(uniform(seed, number, 5) * len(radii)), len(radii) - 1)])

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .advection import advect, captured_density
 from .capture import Capture, features_path, load_capture
 from .cluster import Cluster, Hands, unheard
 from .confidence import confidence, expected_error
@@ -27,7 +28,8 @@ from .files import atomic
 from .geometry import Optics
 from .grow import Grown, GrowParams, grow
 from .hull import Grid, HullParams, blueness, carve, grid_of, occupancy, visual_hull
-from .infill import InfillParams, infill
+from .infill import Captured, InfillParams, infill
+from .inside import InsideParams, surface_distance
 from .journal import Journal, Unwritten
 from .match import Reach, sides_of, sightings
 from .paper import PaperParams, grow_paper
@@ -55,6 +57,7 @@ from .strands import CAPTURED, INFILL, Strands, concatenate, save_strands
 
 VERSION = "0.1.0"
 WORKING_ROOM = 600_000_000  # bytes: the program itself, seed cells, a batch of curves
+UNKNOWN_ERROR_MM = 0.02
 SAMPLED_PHOTOGRAPHS = 24  # that ``estimate`` looks at
 STAMP, JOURNAL, USED_UP = "made-from.txt", "growing.journal", "growing.used"  # in the work folder
 # Table 1: c in 12-bit numbers with the black level (128) in it, omega in degrees, gamma in px, boxes in px
@@ -71,6 +74,7 @@ class Parameters:
     radius: RadiusParams = field(default_factory=RadiusParams)
     paper: PaperParams | None = None  # not None: fibers are grown the paper's way, and ``grow`` and ``refine`` do not count
     hull: HullParams = field(default_factory=HullParams)
+    inside: InsideParams = field(default_factory=InsideParams)
     infill: InfillParams | None = field(default_factory=InfillParams)  # None: captured fibers only
 
 
@@ -84,7 +88,7 @@ def preset(name: str = "auto", method: str = "strandscope") -> Parameters:
     bounds = {"cone_deg": omega, "max_correction_px": gamma, "box_px": boxes}
     if method == "paper":
         ridges = RidgeParams("paper", low=0.03, high=0.08, offset=(c + 128) / (4095 - 128))
-        return Parameters(ridges=ridges, paper=replace(PaperParams(), **bounds))
+        return Parameters(ridges=ridges, paper=replace(PaperParams(), **bounds), infill=InfillParams(method="paper"))
     return Parameters(grow=replace(GrowParams(), **bounds))
 
 
@@ -130,7 +134,7 @@ def reconstruct(
         provenance = {"capture": capture.name, "version": VERSION, "parameters": asdict(parameters)}
         strands = captured_strands(grown, error, radius, provenance)
         if parameters.infill is not None:
-            strands = concatenate([strands, infill_strands(capture, work, sweeps, strands, parameters, workers, progress)], provenance)
+            strands = infill_strands(capture, work, sweeps, strands, parameters, workers, progress)
         save_strands(out, strands)
         journal.delete()
     return strands
@@ -480,6 +484,7 @@ def captured_strands(grown: Grown, error_mm: np.ndarray | None, radius_mm: np.nd
         confidence=(1 - np.exp(grown.evidence / -4.0) if error_mm is None else confidence(error_mm)).astype(np.float32),
         stops=grown.stops,
         error_mm=error_mm,
+        evidence=grown.evidence.astype(np.float32),
         provenance=provenance,
     )
 
@@ -487,13 +492,20 @@ def captured_strands(grown: Grown, error_mm: np.ndarray | None, radius_mm: np.nd
 def infill_strands(
     capture: Capture, work: Path, sweeps: list[SweepFeatures], strands: Strands, parameters: Parameters, workers: int, progress: Progress
 ) -> Strands:
-    """Hair for the inside that no camera sees (sec. 4.3), along the captured ``strands``."""
+    """The captured ``strands`` and hair for the inside that no camera sees (sec. 4.3)."""
     grid, hull, rays = volumes(capture, work, sweeps, parameters.hull, workers, progress)
+    bounds, params = occupancy(hull, rays, grid, parameters.hull), parameters.infill
     with _threads(workers):
-        inside = occupancy(hull, rays, grid, parameters.hull)
-        filled = infill(strands.points_mm, strands.offsets, strands.radius_mm, inside, grid, parameters.infill, progress)
+        if params.method == "paper":
+            advection = replace(params.advection, count=params.count, seed=params.seed)
+            filled = advect(strands.points_mm, strands.offsets, strands.radius_mm, bounds, grid, advection, progress)
+            joins = None
+        else:
+            distance = inside(strands, bounds, grid, [sweep.angle_deg for sweep in capture.sweeps], parameters.inside)
+            filled = infill(_told(strands), distance, grid, [sweep.angle_deg for sweep in capture.sweeps], params, progress)
+            joins = filled.joins
     count = len(filled.offsets) - 1
-    return Strands(
+    added = Strands(
         points_mm=filled.points_mm,
         offsets=filled.offsets,
         radius_mm=filled.radius_mm,
@@ -501,6 +513,23 @@ def infill_strands(
         confidence=np.zeros(len(filled.points_mm), np.float32),
         stops=np.zeros((count, 2), np.uint8),
     )
+    return replace(concatenate([strands, added], strands.provenance), joins=joins)
+
+
+def inside(strands: Strands, bounds: np.ndarray, grid: Grid, angles_deg, params: InsideParams) -> np.ndarray:
+    """Signed distance (nx, ny, nz) mm to the surface of the hair, by the captured strands and the bounding volume."""
+    points, offsets = strands.points_mm.astype(np.float64), strands.offsets
+    diameter = 2 * float(strands.radius_mm.mean())
+    return surface_distance(points, captured_density(points, offsets, grid), bounds, diameter, grid, angles_deg, params)
+
+
+def _told(strands: Strands) -> Captured:
+    """What the infill is told of captured strands; the error of a point that is not known is taken as that of a pixel."""
+    count = len(strands.points_mm)
+    error = np.full(count, UNKNOWN_ERROR_MM) if strands.error_mm is None else np.nan_to_num(strands.error_mm, nan=UNKNOWN_ERROR_MM)
+    evidence = np.zeros(count) if strands.evidence is None else strands.evidence
+    stops = np.zeros((len(strands), 2), np.uint8) if strands.stops is None else strands.stops
+    return Captured(strands.points_mm, strands.offsets, strands.radius_mm, error, evidence, stops)
 
 
 def volumes(

@@ -24,6 +24,8 @@ class Strands:
     confidence: np.ndarray  # (N,) float32, 0 to 1
     stops: np.ndarray | None = None  # (M, 2) uint8: why either end of a curve stopped growing (``stops.Stop``), 0 unknown
     error_mm: np.ndarray | None = None  # (N,) float32: expected error (``confidence.expected_error``), NaN where it is not known
+    evidence: np.ndarray | None = None  # (N,) float32: cameras that saw the point, each by the share of a free view that it had
+    joins: np.ndarray | None = None  # (J, 2) int64: ends at which two curves are one fiber; 2 c: the first point of curve c, 2 c + 1: its last
     provenance: dict = field(default_factory=dict)  # capture's name, parameters, version
 
     def __len__(self) -> int:
@@ -46,12 +48,37 @@ class Strands:
             confidence=self.confidence[points],
             stops=None if self.stops is None else self.stops[keep],
             error_mm=None if self.error_mm is None else self.error_mm[points],
+            evidence=None if self.evidence is None else self.evidence[points],
+            joins=None if self.joins is None else _kept(self.joins, keep),
         )
 
     @property
     def captured(self) -> "Strands":
         """The curves that were seen, without the infill."""
         return self.select(self.kind == CAPTURED)
+
+
+def _kept(joins: np.ndarray, keep: np.ndarray) -> np.ndarray:
+    """The joins between curves that are both kept, in their new numbers."""
+    number = np.cumsum(keep) - 1
+    both = joins[keep[joins // 2].all(axis=1)]
+    return 2 * number[both // 2] + both % 2
+
+
+def fibers(strands: Strands) -> np.ndarray:
+    """For each curve (M,) int64 the number of the fiber that it is a piece of, as ``joins`` tell; without any, a fiber is a curve."""
+    fiber = np.arange(len(strands))
+
+    def root(curve):
+        while fiber[curve] != curve:
+            fiber[curve] = fiber[fiber[curve]]
+            curve = fiber[curve]
+        return curve
+
+    for one, other in () if strands.joins is None else strands.joins // 2:
+        a, b = sorted((root(one), root(other)))
+        fiber[b] = a
+    return np.unique([root(curve) for curve in range(len(strands))], return_inverse=True)[1]
 
 
 def offsets_of(sizes: np.ndarray) -> np.ndarray:
@@ -129,8 +156,20 @@ def concatenate(parts: list[Strands], provenance: dict) -> Strands:
         confidence=np.concatenate([p.confidence for p in parts]),
         stops=np.concatenate([np.zeros((len(p), 2), np.uint8) if p.stops is None else p.stops for p in parts]),
         error_mm=None if all(p.error_mm is None for p in parts) else np.concatenate([_errors(p) for p in parts]),
+        evidence=None if all(p.evidence is None for p in parts) else np.concatenate([_evidence(p) for p in parts]),
+        joins=None if all(p.joins is None for p in parts) else _joins(parts),
         provenance=provenance,
     )
+
+
+def _evidence(strands: Strands) -> np.ndarray:
+    return np.zeros(len(strands.points_mm), np.float32) if strands.evidence is None else strands.evidence
+
+
+def _joins(parts: list[Strands]) -> np.ndarray:
+    """The joins of all parts, in the numbers of their curves together."""
+    before = np.concatenate([[0], np.cumsum([len(p) for p in parts])])
+    return np.concatenate([p.joins + 2 * first for p, first in zip(parts, before[:-1], strict=True) if p.joins is not None])
 
 
 def _errors(strands: Strands) -> np.ndarray:
@@ -151,6 +190,10 @@ def save_strands(path: Path, strands: Strands) -> None:
     }
     if strands.error_mm is not None:
         arrays["error"] = strands.error_mm.astype(np.float32)
+    if strands.evidence is not None:
+        arrays["evidence"] = strands.evidence.astype(np.float32)
+    if strands.joins is not None:
+        arrays["joins"] = strands.joins.astype(np.int64)
     with atomic(path) as part:
         np.savez(part, **arrays)  # numpy writes the zip's time stamps as 1980-01-01
 
@@ -173,6 +216,8 @@ def load_strands(path: Path) -> Strands:
         confidence=arrays.get("confidence", np.ones(count, np.float32)),
         stops=arrays.get("stops"),
         error_mm=arrays.get("error"),
+        evidence=arrays.get("evidence"),
+        joins=arrays.get("joins"),
         provenance=provenance,
     )
     check(strands, path)
@@ -211,6 +256,15 @@ def check(strands: Strands, path: Path) -> None:
         _expect(strands.error_mm.shape == (len(points),), path, "error", strands.error_mm.shape, f"one value a point ({len(points)},)")
         good = np.isnan(strands.error_mm) | ((strands.error_mm >= 0) & np.isfinite(strands.error_mm))
         _expect(bool(np.all(good)), path, "error", "outside its range", "0 mm or more, or NaN where it is not known")
+    if strands.evidence is not None:
+        _expect(strands.evidence.shape == (len(points),), path, "evidence", strands.evidence.shape, f"one value a point ({len(points)},)")
+        good = bool(np.all(np.isfinite(strands.evidence) & (strands.evidence >= 0)))
+        _expect(good, path, "evidence", "outside its range", "0 cameras or more")
+    joins = strands.joins
+    if joins is not None:
+        _expect(joins.ndim == 2 and joins.shape[1] == 2 and np.issubdtype(joins.dtype, np.integer), path, "joins", joins.shape, "integers (J, 2)")
+        good = not joins.size or (joins.min() >= 0 and joins.max() < 2 * len(strands) and np.unique(joins).size == joins.size)
+        _expect(bool(good), path, "joins", "not of ends", f"0 … {2 * len(strands) - 1}, each end in one join at most")
     for name, values in (("points", points), ("radius", strands.radius_mm), ("confidence", strands.confidence)):
         bad = np.argwhere(~np.isfinite(values))
         if len(bad):

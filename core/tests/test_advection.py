@@ -6,9 +6,9 @@ import numba
 import numpy as np
 import pytest
 
+from strandscope.core.advection import AdvectionParams, advect, captured_density, curve_signs, direction_field, missing_density
 from strandscope.core.errors import StrandscopeError
 from strandscope.core.hull import Grid
-from strandscope.core.infill import InfillParams, captured_density, curve_signs, direction_field, infill, missing_density
 
 GRID = Grid.around((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0), 0.25)
 EVERYWHERE = np.ones(GRID.shape, np.float32)
@@ -74,7 +74,7 @@ def test_field_is_the_mean_tangent_and_fills_the_gap():
 
 def test_solving_is_bounded_to_a_margin():
     points, offsets = parallel_hair([(0.0, 0.0)])
-    field = direction_field(points, offsets, GRID, None, InfillParams(margin_mm=1.0))
+    field = direction_field(points, offsets, GRID, None, AdvectionParams(margin_mm=1.0))
     size = np.linalg.norm(field, axis=-1)
     radius = np.maximum(np.abs(centres()[..., 0]), np.abs(centres()[..., 2]))
     assert np.all(size[radius > 1.5] == 0)
@@ -87,7 +87,7 @@ def test_solving_is_bounded_to_a_margin():
 def test_infill_follows_a_helix():
     pitch = 6.0
     points, offsets = helices(pitch)
-    grown = infill(points, offsets, np.full(len(offsets) - 1, 0.04), EVERYWHERE, GRID, InfillParams(count=40, step_mm=0.05))
+    grown = advect(points, offsets, np.full(len(offsets) - 1, 0.04), EVERYWHERE, GRID, AdvectionParams(count=40, step_mm=0.05))
     assert len(grown.offsets) == 41
     for a, b in pairwise(grown.offsets):
         x, y, z = grown.points_mm[a:b].T
@@ -102,7 +102,7 @@ def test_infill_follows_a_helix():
 
 def test_steps_have_the_step_length_and_strands_reach_the_bounds():
     points, offsets = parallel_hair([(x, z) for x in (-1.0, 1.0) for z in (-1.0, 1.0)])
-    grown = infill(points, offsets, np.full(4, 0.04), EVERYWHERE, GRID, InfillParams(count=20, step_mm=0.1))
+    grown = advect(points, offsets, np.full(4, 0.04), EVERYWHERE, GRID, AdvectionParams(count=20, step_mm=0.1))
     steps = np.linalg.norm(np.diff(grown.points_mm, axis=0), axis=1)
     steps = np.delete(steps, grown.offsets[1:-1] - 1)
     assert np.allclose(steps, 0.1, atol=1e-4)
@@ -115,10 +115,10 @@ def test_a_strand_that_leaves_the_hull_is_dropped():
     x = np.linspace(-2.95, 2.95, 60)
     points, offsets = flat([np.stack([x, np.full_like(x, y), np.full_like(x, z)], axis=1) for y in (-1, 0, 1) for z in (-1, 0, 1)])
     half = np.where(centres()[..., 0] < 0, 1.0, 0.0).astype(np.float32)
-    strict = infill(points, offsets, np.full(9, 0.04), half, GRID, InfillParams(count=10, min_mean_density=0.6, max_failures=5))
+    strict = advect(points, offsets, np.full(9, 0.04), half, GRID, AdvectionParams(count=10, min_mean_density=0.6, max_failures=5))
     assert strict.accepted == len(strict.offsets) - 1 == 0
     assert strict.rejected >= 50
-    lenient = infill(points, offsets, np.full(9, 0.04), half, GRID, InfillParams(count=10, min_mean_density=0.4))
+    lenient = advect(points, offsets, np.full(9, 0.04), half, GRID, AdvectionParams(count=10, min_mean_density=0.4))
     assert (lenient.accepted, lenient.rejected) == (10, 0)
 
 
@@ -135,7 +135,7 @@ def test_hollow_core_is_filled_to_the_density_around_it():
     where, seen = hollow_lock()
     points, offsets = parallel_hair(where[seen])
     occupancy = (np.hypot(centres()[..., 0], centres()[..., 2]) < 2.4).astype(np.float32)
-    grown = infill(points, offsets, np.full(seen.sum(), 0.04), occupancy, GRID)
+    grown = advect(points, offsets, np.full(seen.sum(), 0.04), occupancy, GRID)
     hidden = (~seen).sum()
     assert hidden * 0.75 < grown.accepted < hidden * 1.35  # 41 strands hidden
     radius = np.hypot(grown.points_mm[:, 0], grown.points_mm[:, 2])
@@ -160,14 +160,14 @@ def test_the_same_seed_gives_the_same_strands_on_any_number_of_threads():
     radii = np.random.default_rng(8).uniform(0.03, 0.05, len(offsets) - 1)
     arguments = points, offsets, radii, EVERYWHERE, GRID
     threads = numba.get_num_threads()
-    many = infill(*arguments, InfillParams(count=30))
+    many = advect(*arguments, AdvectionParams(count=30))
     try:
         numba.set_num_threads(1)
-        one = infill(*arguments, InfillParams(count=30))
+        one = advect(*arguments, AdvectionParams(count=30))
     finally:
         numba.set_num_threads(threads)
     assert all(np.array_equal(a, b) for a, b in zip(many, one, strict=True))
-    other = infill(*arguments, InfillParams(count=30, seed=1))
+    other = advect(*arguments, AdvectionParams(count=30, seed=1))
     assert len(other.offsets) == len(many.offsets)
     assert not np.array_equal(other.points_mm[other.offsets[:-1]], many.points_mm[many.offsets[:-1]])
 
@@ -176,7 +176,7 @@ def test_radius_is_that_of_a_captured_curve():
     points, offsets = parallel_hair([(-1.0, 0.0), (1.0, 0.0)])
     per_point = np.repeat([0.03, 0.05], np.diff(offsets))
     for radii in (np.array([0.03, 0.05]), per_point):
-        grown = infill(points, offsets, radii, EVERYWHERE, GRID, InfillParams(count=40))
+        grown = advect(points, offsets, radii, EVERYWHERE, GRID, AdvectionParams(count=40))
         assert grown.radius_mm.shape == (len(grown.points_mm),)
         assert grown.radius_mm.dtype == grown.points_mm.dtype == np.float32
         first = grown.radius_mm[grown.offsets[:-1]]
@@ -185,7 +185,7 @@ def test_radius_is_that_of_a_captured_curve():
 
 def test_no_strands_where_none_are_wanted():
     points, offsets = parallel_hair([(0.0, 0.0)])
-    none = infill(points, offsets, [0.04], EVERYWHERE, GRID, InfillParams(count=0))
+    none = advect(points, offsets, [0.04], EVERYWHERE, GRID, AdvectionParams(count=0))
     assert len(none.points_mm) == 0
     assert none.offsets.tolist() == [0]
 
@@ -193,7 +193,7 @@ def test_no_strands_where_none_are_wanted():
 def test_progress_is_told_to_the_end():
     told = []
     points, offsets = parallel_hair([(0.0, 0.0)])
-    infill(points, offsets, [0.04], EVERYWHERE, GRID, InfillParams(count=5), lambda *event: told.append(event))
+    advect(points, offsets, [0.04], EVERYWHERE, GRID, AdvectionParams(count=5), lambda *event: told.append(event))
     assert told[-1] == ("infill", 5, 5)
 
 
@@ -210,4 +210,4 @@ def test_progress_is_told_to_the_end():
 )
 def test_bad_input_is_an_error_in_words(points, offsets, radii, occupancy, words):
     with pytest.raises(StrandscopeError, match=words):
-        infill(points, offsets, radii, occupancy, GRID)
+        advect(points, offsets, radii, occupancy, GRID)
