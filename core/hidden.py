@@ -18,8 +18,9 @@ SEEN_BY = np.array([0.0, 0.3, 0.6, 1.0, 1.5, 2.1, 3.0, 4.0, 5.2, 7.0, 9.5, 13.0]
 FOUND = np.array([0.03, 0.12, 0.38, 0.62, 0.76, 0.84, 0.9, 0.92, 0.94, 0.965, 0.985, 0.995])  # of hair that so many angles see; simulated locks
 ROUNDS = 4  # in which missing hair and what it hides are found from each other
 FULL = 0.75  # quantile of the density where hair was found: hair that is whole
+DARK, DARKEST = 0.1, 0.05  # share of the rays in the open: where fewer pass, hair is in the way; where far fewer, it is hair that nobody sees
 HALF_SEEN = (1.5, 5.0)  # captured places that so many angles should see tell by how many did what else is in the way
-EVIDENCE = 0.8  # angles that see a place, for each that has seen a hair there; simulated locks
+EVIDENCE = 0.85  # angles that see a place, for each that has seen a hair there; simulated locks
 SHARES = np.array([0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0])  # of a full inside that are tried
 
 
@@ -51,6 +52,7 @@ class Hidden(NamedTuple):
 def hidden(
     density: np.ndarray,
     body: np.ndarray,
+    through: np.ndarray,
     diameter_mm: float,
     grid: Grid,
     angles_deg: np.ndarray,
@@ -59,36 +61,45 @@ def hidden(
     blur_mm: float = 0.5,
     view_blur_mm: float = 0.15,
 ) -> Hidden:
-    """Estimate the hair that was not found, from what was found and by how many cameras.
+    """Estimate the hair that was not found, where little light passes.
 
-    density (nx, ny, nz) mm/mm³: of what was found; body (nx, ny, nz), 0…1: where hair stands, without air about it; points_mm (N, 3) and
-    evidence (N,): captured points, and the cameras that saw each. Were the body as full everywhere as it is where all is found, few
-    angles would see its inside. Of that hidden hair, as much is taken as hides the captured points as much as they were found hidden:
-    the density of the found hair alone would let more cameras see them.
+    density (nx, ny, nz) mm/mm³: of what was found; body (nx, ny, nz), 0…1: where hair stands, without air about it; through (nx, ny, nz):
+    rays that pass, as a share of those in the open (``hull.free_share``); points_mm (N, 3) and evidence (N,): captured points, and the
+    cameras that saw each.
+
+    Two estimates, of which the larger holds at each voxel. Where the body is darkest, hair is as dense as where all of it is found. And
+    were the dark body full, few angles would see its inside; of that hidden hair, as much is there as hides the captured points as much
+    as they were found hidden: the found hair alone would let more cameras see them.
     """
     body = np.asarray(grid.check(body, "the body"), np.float32)
+    grid.check(through, "the share of rays")
     whole = _full(density, body, blur_mm / grid.voxel_mm)
 
     def seen(hair):
         return seen_from(gaussian_filter(hair, view_blur_mm / grid.voxel_mm), diameter_mm, grid, angles_deg)
 
-    unfound = whole * body * (1.0 - found_share(seen(np.maximum(whole * body, density))))
+    def dark(below):
+        return gaussian_filter(np.clip(1.5 - through / below, 0.0, 1.0).astype(np.float32), _DARK_BLUR_MM / grid.voxel_mm)
+
+    empty = np.maximum(whole * body * dark(DARKEST) - gaussian_filter(density, _EMPTY_BLUR_MM / grid.voxel_mm), 0.0)
+    behind = whole * body * dark(DARK) * (1.0 - found_share(seen(np.maximum(whole * body, density))))
     cells = (grid.to_cells(points_mm) - 0.5).T
     ratios = []
     for share in SHARES:
-        now = seen(density + np.float32(share) * unfound)
-        at = map_coordinates(now, cells, order=1, mode="nearest")
+        at = map_coordinates(seen(density + np.float32(share) * behind), cells, order=1, mode="nearest")
         if share == 0.0:
             told = (at > HALF_SEEN[0]) & (at < HALF_SEEN[1]) & (evidence > 0)
-            if not told.any():
-                return Hidden(np.zeros_like(unfound), found_share(now))
+        if not told.any():
+            break
         ratios.append(float(at[told].sum() / evidence[told].sum()))
         if ratios[-1] <= EVIDENCE:
             break
-    count = len(ratios)
-    share = np.interp(-EVIDENCE, -np.array(ratios), SHARES[:count])
-    missing = (np.float32(share) * unfound).astype(np.float32)
+    share = np.interp(-EVIDENCE, -np.array(ratios), SHARES[: len(ratios)]) if ratios else 0.0
+    missing = np.maximum(np.float32(share) * behind, empty).astype(np.float32)
     return Hidden(missing, found_share(seen(density + missing)))
+
+
+_DARK_BLUR_MM, _EMPTY_BLUR_MM = 0.2, 0.3  # of what is dark; of the density beside which the body is empty
 
 
 def _full(density, body, sigma):

@@ -448,6 +448,16 @@ def empty_rays(ray_count: np.ndarray, hull: np.ndarray) -> float:
     return float(np.quantile(outside, 0.9))
 
 
+def free_share(ray_count: np.ndarray, open_air: np.ndarray) -> np.ndarray:
+    """Rays through each voxel as a share of those that pass where nothing is in the way: (nx, ny, nz) float32.
+
+    ray_count: of ``carve``; open_air (nx, ny, nz) bool: voxels outside the hair. The number of rays depends on how much hair there is to be
+    seen and how well it is found; what it is in the open tells how many could have passed.
+    """
+    outside = ray_count[open_air & (ray_count > 0)]
+    return (ray_count / max(float(np.median(outside)) if len(outside) else 0.0, 1.0)).astype(np.float32)
+
+
 def otsu(values: np.ndarray, bins: int = 256) -> float | None:
     """Otsu's threshold of values (n,): the one with the greatest variance between the two kinds; None if all are equal."""
     if not len(values) or values.min() == values.max():

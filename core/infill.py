@@ -8,6 +8,7 @@ that the cameras are likely to have missed is taken (``hidden``). Then all are p
 """
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -35,10 +36,11 @@ class InfillParams:
     count: int | None = None  # whole hidden fibers to add; None: as many as are missing by the density of the captured ones
     step_mm: float = 0.2  # between points
     seed: int = 0
-    tries: int = 16  # strands of which one is taken
+    tries: int = 16  # continuations of which one is taken
+    whole_tries: int = 2  # and whole fibers
     flow_mm: float = 0.5  # standard deviation of the distance at which neighbours tell the way
     hidden_mm: float = 1.0  # length over which hair is found or not as a whole
-    density_mm: float = 0.8  # standard deviation of the blur of what is still missing
+    density_mm: float = 0.4  # standard deviation of the blur of what is still missing
     air_mm: float = 0.4  # depth below the surface of the occupancy at which the hair itself begins
     air_cost: float = 3.0  # a mm outside the hull, in logs of probability
     meeting_cost: float = 6.0  # a mm that runs through a captured curve
@@ -69,9 +71,16 @@ class Captured(NamedTuple):
 
 
 def infill(
-    captured: Captured, distance_mm: np.ndarray, grid: Grid, angles_deg, params: InfillParams | None = None, progress: Progress = silent
+    captured: Captured,
+    distance_mm: np.ndarray,
+    through: np.ndarray,
+    grid: Grid,
+    angles_deg: np.ndarray,
+    params: InfillParams | None = None,
+    progress: Progress = silent,
 ) -> Infill:
-    """Strands for what no camera sees. distance_mm (nx, ny, nz): of ``inside.surface_distance``; angles_deg (a,): of the sweeps.
+    """Strands for what no camera sees. distance_mm (nx, ny, nz): of ``inside.surface_distance``; through (nx, ny, nz): of
+    ``hull.free_share``; angles_deg (a,): of the sweeps.
 
     The same input gives the same strands, whatever the number of threads. Raises StrandscopeError without captured curves, where the
     volume is empty, and for wrong shapes.
@@ -83,7 +92,7 @@ def infill(
     field_ = direction_field(points, offsets, grid, occupancy, params.advection)
     progress("infill", 1, _STEPS)
     density, diameter = captured_density(points, offsets, grid), 2 * float(radii.mean())
-    unseen = hidden(density, body, diameter, grid, angles_deg, points, np.asarray(captured.evidence, float))
+    unseen = hidden(density, body, through, diameter, grid, angles_deg, points, np.asarray(captured.evidence, float))
     progress("infill", 2, _STEPS)
     streams, course = _course(points, offsets, diameter, field_, unseen.found, occupancy, grid, params)
     links, open_ends = find_links(points, offsets, captured.error_mm, captured.stops, params.links)
@@ -119,7 +128,7 @@ _BEND_MM = 0.5  # over which curvature and its change are told
 def as_smooth_as(points: np.ndarray, offsets: np.ndarray, strands: list, before: list, step_mm: float) -> list:
     """The strands, smoothed until they are no rougher than the curves (N, 3) are: the way that neighbours tell is rough, and what a
     captured hair departs from it has that roughness in it too. before: the points that each strand goes on behind, or none."""
-    wanted = _roughness([points[a:b] for a, b in zip(offsets[:-1], offsets[1:], strict=True)], step_mm)
+    wanted = _roughness([points[a:b] for a, b in pairwise(offsets)], step_mm)
     rough = []
     for sigma in _SMOOTHINGS_MM:
         smooth = [_smoothed(strand, some, sigma / step_mm) for strand, some in zip(strands, before, strict=True)]
@@ -387,7 +396,7 @@ def _go_on(streams, course, number, own, before, way, out):
 
 # ---- whole fibers ----------------------------------------------------------------------------------------------------
 
-_PARTS = 6  # in which whole fibers are added; each sees what those before have filled
+_PARTS = 16  # in which whole fibers are added; each sees what those before have filled
 
 
 def _whole(missing, strands, streams, course, grid, params):
@@ -420,9 +429,9 @@ def _some_whole(wanted, by_count, before, cells, weights, longest, streams, cour
     guess = int(np.ceil(wanted)) if by_count else int(np.ceil(wanted / max(course.top_mm - course.bottom_mm, 1e-6)))
     for turn in range(8):
         size = max(guess - len(whole), 1)
-        first = _WHOLE + (before + len(whole)) * params.tries + turn * 1_000_003
+        first = _WHOLE + (before + len(whole)) * params.whole_tries + turn * 1_000_003
         out, sizes = np.zeros((size, 2 * longest, 3)), np.zeros(size, np.int64)
-        _try_whole(streams, course, first, cells, weights, np.asarray(grid.shape), params.tries, out, sizes)
+        _try_whole(streams, course, first, cells, weights, np.asarray(grid.shape), params.whole_tries, out, sizes)
         for strand, length in zip(out, sizes, strict=True):
             if length * course.step_mm < params.least_new_mm:
                 continue

@@ -6,6 +6,7 @@ filter; two ends are linked where they meet more probably than any two ends woul
 """
 
 from dataclasses import dataclass
+from math import lgamma
 from typing import NamedTuple
 
 import numpy as np
@@ -21,9 +22,10 @@ class LinkParams:
 
     longest_mm: float = 10.0  # gap that is linked
     usual_mm: float = 3.0  # gap that is expected
-    least_score: float = -1.0  # log of how much more probable a link is than chance
+    least_score: float = -6.0  # log of how much more probable a link is than chance
     error_factor: float = 1.8  # of what is told as the error of a point: what it is in truth, at places that few cameras see
-    end_error_mm: float = 0.08  # at an open end, where a curve may lean towards a neighbour
+    unsure_mm: float = 0.4  # of a curve before an open end, which may lean towards a neighbour: it does not tell where the hair goes
+    end_error_mm: float = 0.03  # where that begins
     end_decay_mm: float = 0.5  # by which that falls along the curve
     least_error_mm: float = 0.004  # of a point
 
@@ -39,7 +41,7 @@ class Link(NamedTuple):
     """Two open ends of one fiber. End 2 c is the first point of curve c, 2 c + 1 its last."""
 
     ends: tuple[int, int]
-    length_mm: float  # of the hair between them
+    length_mm: float  # of the hair between them; below 0 where they run past each other
     score: float
 
 
@@ -50,6 +52,10 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 _BACK = np.array([1.0, -1.0, 1.0])  # a state seen the other way: the direction turns round
 _SLOPE = 0.2  # of hair that has nothing to do with an end, either way across it
 _USED = 25  # points of a curve that tell the state of its end
+_LEANING_MM = 0.03  # added to the errors of points where only the way of an end is wanted
+_TOLD_BY = 4  # points by which the way of a curve's end is told
+_FREEDOM = 4.0  # degrees of, of how far ends miss each other
+_CROWD_MM = 1.0  # about an end, in which ends are counted
 _AHEAD = 0.3  # cosine: what an end may be linked with lies ahead of it
 
 
@@ -108,11 +114,12 @@ def find_links(
     open_ends = np.flatnonzero(np.asarray(stops).ravel() != Stop.LEFT_VOLUME)
     if len(open_ends) < 2:
         return [], open_ends
-    states = [_state(*_leading(points, error_mm, offsets, end), wander, params) for end in open_ends]
+    states = [_state(*_sure(*_leading(points, error_mm, offsets, end), params), wander, params) for end in open_ends]
     mean, spread = np.stack([s[0] for s in states]), np.stack([s[1] for s in states])
     one, other = _candidates(mean, open_ends, params)
-    volume = float(np.prod(np.maximum(np.ptp(points, axis=0), 1e-3)))
-    score, length = _scores(mean, spread, one, other, wander, len(open_ends) / volume, params)
+    score, length = _scores(mean, spread, one, other, wander, _crowd(mean[:, 0]), params)
+    tips = np.stack([_leading(points, error_mm, offsets, end)[0][-1] for end in open_ends])
+    length -= np.sum((tips[one] - mean[one, 0]) * mean[one, 1], axis=1) + np.sum((tips[other] - mean[other, 0]) * mean[other, 1], axis=1)
     links, used = [], np.zeros(len(open_ends), bool)
     for k in np.lexsort((other, one, -score)):
         if score[k] < params.least_score:
@@ -129,7 +136,8 @@ def ways_on(points_mm: np.ndarray, offsets: np.ndarray, error_mm: np.ndarray, en
     params = params or LinkParams()
     points, offsets = np.asarray(points_mm, np.float64), np.asarray(offsets, np.int64)
     wander = bends(points, offsets)
-    ways = np.array([_state(*_leading(points, error_mm, offsets, end), wander, params)[0][1] for end in ends]).reshape(-1, 3)
+    pieces = [_leading(points, error_mm, offsets, end) for end in ends]
+    ways = np.array([_state(piece, error + _LEANING_MM, wander, params)[0][1] for piece, error in pieces]).reshape(-1, 3)
     return ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
 
 
@@ -138,6 +146,13 @@ def _leading(points, error_mm, offsets, end):
     first, last = offsets[end // 2], offsets[end // 2 + 1]
     which = np.arange(max(first, last - _USED), last) if end % 2 else np.arange(first, min(first + _USED, last))[::-1]
     return points[which], np.nan_to_num(np.asarray(error_mm, np.float64)[which], nan=0.02)
+
+
+def _sure(points, error, params):
+    """Points (n, 3) and errors (n,) of a curve up to where it begins to be unsure of its end; of a short one, the first half."""
+    left = np.r_[np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)[::-1])[::-1], 0.0]
+    size = max(int(np.sum(left >= params.unsure_mm)), min((len(points) + 1) // 2, len(points)), min(3, len(points)))
+    return points[:size], error[:size]
 
 
 def _state(points, error, wander, params):
@@ -177,6 +192,12 @@ def _carried(length, wander):
     return carry, (pulse * weight[..., None, :]) @ np.swapaxes(pulse, -1, -2)
 
 
+def _crowd(places):
+    """How many open ends there are about each (n,), in 1/mm³."""
+    around = cKDTree(places).query_ball_point(places, _CROWD_MM, return_length=True)
+    return around / (4 / 3 * np.pi * _CROWD_MM**3)
+
+
 def _candidates(mean, open_ends, params):
     """Pairs of ends (k,), (k,) of different curves that lie ahead of each other."""
     pairs = cKDTree(mean[:, 0]).query_pairs(params.longest_mm, output_type="ndarray").reshape(-1, 2)
@@ -203,12 +224,18 @@ def _scores(mean, spread, one, other, wander, per_mm3, params):
     miss = (come - there) @ axes  # (k, 3, 2)
     total = carry @ spread[one] @ np.swapaxes(carry, -1, -2) + noise + there_spread
     squares = np.sum(miss * np.linalg.solve(total, miss), axis=(1, 2))
-    link = -0.5 * squares - np.linalg.slogdet(2 * np.pi * total)[1] - length / params.usual_mm - np.log(params.usual_mm)
+    link = _student(squares) - np.linalg.slogdet(total)[1] - length / params.usual_mm - np.log(params.usual_mm)
     slope, bend = here[:, 1:2] @ axes, there[:, 2:3] @ axes
-    chance = np.log(per_mm3) - 0.5 * np.sum(slope**2, axis=(1, 2)) / _SLOPE**2 - np.log(2 * np.pi * _SLOPE**2)
+    chance = np.log(np.maximum(per_mm3[one], per_mm3[other])) - 0.5 * np.sum(slope**2, axis=(1, 2)) / _SLOPE**2 - np.log(2 * np.pi * _SLOPE**2)
     chance = chance - 0.5 * np.sum(bend**2, axis=(1, 2)) / wander.spread**2 - np.log(2 * np.pi * wander.spread**2)
     against = np.sum(come[:, 1] * there[:, 1], axis=1) < _AHEAD
     return np.where(against | (length > 1.5 * params.longest_mm), -np.inf, link - chance), length
+
+
+def _student(squares):
+    """Log density of Student's distribution in six dimensions, but for its scale: curves go astray at their ends more often than Gauss's says."""
+    whole = 0.5 * (_FREEDOM + 6)
+    return lgamma(whole) - lgamma(0.5 * _FREEDOM) - 3 * np.log(_FREEDOM * np.pi) - whole * np.log1p(squares / _FREEDOM)
 
 
 def _axes(tangents):
@@ -228,14 +255,18 @@ def bridge(
     """
     params = params or LinkParams()
     points, offsets = np.asarray(points_mm, np.float64), np.asarray(offsets, np.int64)
+    here, there = (_leading(points, error_mm, offsets, end)[0] for end in link.ends)
+    gap = there[-1] - here[-1]
+    ways = [piece[-1] - piece[max(len(piece) - 1 - _TOLD_BY, 0)] for piece in (here, there)]
+    if link.length_mm <= step_mm or np.sum(gap * ways[0]) <= 0 or np.sum(gap * ways[1]) >= 0:
+        return np.empty((0, 3))
     wander = bends(points, offsets)
-    pieces = [_leading(points, error_mm, offsets, end) for end in link.ends]
-    (here, _), (there, _) = (_state(*piece, wander, params) for piece in pieces)
-    here[0], there[0] = pieces[0][0][-1], pieces[1][0][-1]
-    length = max(float(np.linalg.norm(there[0] - here[0])), link.length_mm)
+    states = [_state(piece, np.zeros(len(piece)), wander, params)[0] for piece in (here, there)]
+    states[0][0], states[1][0] = here[-1], there[-1]
+    length = max(float(np.linalg.norm(gap)), link.length_mm)
     count = max(round(length / step_mm) - 1, 0)
     t = (np.arange(count) + 1) / (count + 1)
-    return _quintic(here, there * _BACK[:, None], length, t)
+    return _quintic(states[0], states[1] * _BACK[:, None], length, t)
 
 
 def _quintic(here, there, length, t):

@@ -27,7 +27,7 @@ from .features import RECORDS, Index, SweepFeatures, build_index, load_features,
 from .files import atomic
 from .geometry import Optics
 from .grow import Grown, GrowParams, grow
-from .hull import Grid, HullParams, blueness, carve, grid_of, occupancy, visual_hull
+from .hull import Grid, HullParams, blueness, carve, free_share, grid_of, occupancy, visual_hull
 from .infill import Captured, InfillParams, infill
 from .inside import InsideParams, surface_distance
 from .journal import Journal, Unwritten
@@ -501,8 +501,10 @@ def infill_strands(
             filled = advect(strands.points_mm, strands.offsets, strands.radius_mm, bounds, grid, advection, progress)
             joins = None
         else:
-            distance = inside(strands, bounds, grid, [sweep.angle_deg for sweep in capture.sweeps], parameters.inside)
-            filled = infill(_told(strands), distance, grid, [sweep.angle_deg for sweep in capture.sweeps], params, progress)
+            angles = np.array([sweep.angle_deg for sweep in capture.sweeps])
+            distance = inside(strands, bounds, grid, angles, parameters.inside)
+            through = free_share(rays, distance < -parameters.inside.about_mm / 2)
+            filled = infill(_told(strands), distance, through, grid, angles, params, progress)
             joins = filled.joins
     count = len(filled.offsets) - 1
     added = Strands(
