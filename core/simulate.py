@@ -700,17 +700,45 @@ def begin(out: Path, params: SimulateParams, more: dict | None = None) -> bool:
     return (out / FILE_NAME).is_file()
 
 
+@dataclass(frozen=True)
+class Studio:
+    """Known hair before its board and light, to be photographed at any angle and focus."""
+
+    params: SimulateParams
+    optics: Optics
+    hair: Hair
+    fog: Density
+    background: np.ndarray  # (4, rows, columns) of the board
+    gain: float  # of the exposure
+    reach_mm: float  # few fibers fly off farther
+
+    def at(self, angle_deg: float) -> Drawing:
+        """The hair turned by an angle, shaded; it serves for all photographs there."""
+        shaded = shade(self.hair, self.fog, LOOKS[self.params.style], angle_deg, self.optics.working_distance_mm)
+        return drawing(self.hair, angle_deg, replace(shaded, color=shaded.color * np.float32(self.gain)), self.optics)
+
+    def mosaic(self, drawn: Drawing, focus_mm: float, f_number: float, rng, brighter: float = 1.0) -> np.ndarray:
+        """The mosaic (2 rows, 2 columns) uint16 that the camera takes at a focus and an aperture; ``brighter`` is its gain."""
+        through = replace(self.optics, aperture_cone_deg=stopped_cone_deg(self.params, f_number))
+        disc = lens(lens_count(through, self.reach_mm + abs(focus_mm)), aperture_radius_mm(through), len(self.background[0]) + 1, rng)
+        planes = photograph(drawn, self.background, through, focus_mm, disc)
+        return expose(planes * np.float32(brighter), self.params.full_well_e, self.params.read_noise_e, rng)
+
+
+def studio(params: SimulateParams, optics: Optics, hair: Hair) -> Studio:
+    """Board, light and exposure for hair."""
+    look, fog = LOOKS[params.style], density(hair)
+    reach = float(np.percentile(np.hypot(hair.points_mm[:, 0], hair.points_mm[:, 2]), 99))
+    background = board(optics, (params.size.rows, params.size.columns), look)
+    return Studio(params, optics, hair, fog, background, _gain(hair, fog, look, params), reach)
+
+
 def _photographs(capture: Capture, hair: Hair, params: SimulateParams, progress: Progress, pool: ThreadPoolExecutor) -> None:
     """Take all photographs that are not there yet."""
-    scale, optics, look = params.size, capture.optics, LOOKS[params.style]
-    background = board(optics, (scale.rows, scale.columns), look)
-    fog = density(hair)
-    gain = _gain(hair, fog, look, params)
-    reach = float(np.percentile(np.hypot(hair.points_mm[:, 0], hair.points_mm[:, 2]), 99))  # few fibers fly off farther
-    stopped = replace(optics, aperture_cone_deg=stopped_cone_deg(params))
-    sequences = [(s.angle_deg, d, f, optics, g) for s in capture.sweeps for d, f, g in zip(s.positions_mm, s.files, s.gains, strict=True)]
+    camera, opened = studio(params, capture.optics, hair), params.open_f_number
+    sequences = [(s.angle_deg, d, f, opened, g) for s in capture.sweeps for d, f, g in zip(s.positions_mm, s.files, s.gains, strict=True)]
     if stills := capture.turntable:
-        sequences += [(a, stills.focus_mm, f, stopped, 1.0) for a, f in zip(stills.angles_deg, stills.files, strict=True)]
+        sequences += [(a, stills.focus_mm, f, params.turntable_f_number, 1.0) for a, f in zip(stills.angles_deg, stills.files, strict=True)]
     by_angle: dict[float, list] = {}
     for number, (angle, *shot) in enumerate(sequences):
         by_angle.setdefault(angle, []).append((number, *shot))
@@ -720,15 +748,12 @@ def _photographs(capture: Capture, hair: Hair, params: SimulateParams, progress:
         done += len(shots) - len(missing)
         if not missing:
             continue
-        shaded = shade(hair, fog, look, angle, optics.working_distance_mm)
-        drawn = drawing(hair, angle, replace(shaded, color=shaded.color * np.float32(gain)), optics)
+        drawn = camera.at(angle)
 
         def take(shot, drawn=drawn):
-            number, focus, file, through, brighter = shot
+            number, focus, file, f_number, brighter = shot
             rng = np.random.default_rng([params.seed, 2, number])
-            disc = lens(lens_count(through, reach + abs(focus)), aperture_radius_mm(through), scale.rows + 1, rng)
-            planes = photograph(drawn, background, through, focus, disc)
-            write_dng(capture.folder / file, expose(planes * np.float32(brighter), params.full_well_e, params.read_noise_e, rng), BLACK, WHITE)
+            write_dng(capture.folder / file, camera.mosaic(drawn, focus, f_number, rng, brighter), BLACK, WHITE)
 
         for _ in each_of(pool, take, missing):
             done += 1
@@ -746,9 +771,11 @@ def each_of(pool: ThreadPoolExecutor, work, items):
             future.cancel()
 
 
-def stopped_cone_deg(params: SimulateParams) -> float:
-    """Full angle of the cone at the f-number of the turntable sequence; the radius of the aperture goes with 1 / f-number."""
-    tangent = math.tan(math.radians(params.aperture_cone_deg) / 2) * params.open_f_number / params.turntable_f_number
+def stopped_cone_deg(params: SimulateParams, f_number: float) -> float:
+    """Full angle of the cone at an f-number; the radius of the aperture goes with 1 / f-number."""
+    if f_number == params.open_f_number:
+        return params.aperture_cone_deg
+    tangent = math.tan(math.radians(params.aperture_cone_deg) / 2) * params.open_f_number / f_number
     return math.degrees(2 * math.atan(tangent))
 
 

@@ -33,6 +33,11 @@ class Reporter:
         """What a reader should know while the work goes on; one line on stderr."""
         print(f"strandscope: {text}", file=sys.stderr, flush=True)
 
+    def event(self, event: dict) -> None:
+        """What work that others can attach to tells of itself; its messages are notes."""
+        if event.get("message"):
+            self.note(event["message"])
+
     def done(self, output: Path) -> None:
         """The work succeeded, and what came of it is at ``output``."""
 
@@ -121,6 +126,9 @@ class Events(Reporter):
 
     def note(self, text):
         self._print(event="note", message=text)
+
+    def event(self, event):
+        self._print(**event)
 
     def done(self, output):
         self._print(event="done", output=str(output))

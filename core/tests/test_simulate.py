@@ -434,7 +434,7 @@ def test_the_paper_scale_is_that_of_the_paper():
     assert sum(len(s.files) for s in capture.sweeps) == 9024
     assert (capture.sweeps[0].positions_mm[0], capture.sweeps[0].positions_mm[-1]) == (-37.5, 37.5)
     assert aperture_radius_mm(capture.optics) == pytest.approx(28.87, abs=0.01)
-    assert module.stopped_cone_deg(SimulateParams()) == pytest.approx(1.754, abs=0.001)
+    assert module.stopped_cone_deg(SimulateParams(), 16.0) == pytest.approx(1.754, abs=0.001)
 
 
 def test_the_board_is_blue_and_hair_stands_out_in_red():
