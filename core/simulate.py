@@ -658,7 +658,7 @@ def simulate(out: Path, params: SimulateParams, progress: Progress = silent, wor
         rig = params.misalignment.errors(capture).corrected(capture)
         _photographs(rig, hair, params, progress, pool)
         if not capture.truth_path.is_file():
-            _write_truth(rig, lock, hair, params, progress, pool)
+            take_truth(rig, lock, hair, params, progress, pool)
     save_capture(replace(capture, unknown={"simulation": asdict(params)}))
     return load_capture(out)
 
@@ -785,7 +785,7 @@ def _gain(hair: Hair, fog: Density, look: Look, params: SimulateParams) -> float
     return params.exposure / float(np.percentile(np.concatenate(shades), 99))
 
 
-def _write_truth(capture: Capture, lock: Groom, hair: Hair, params: SimulateParams, progress: Progress, pool: ThreadPoolExecutor) -> None:
+def take_truth(capture: Capture, lock: Groom, hair: Hair, params: SimulateParams, progress: Progress, pool: ThreadPoolExecutor) -> None:
     """truth.npz: the fibers, samples of them inside the captured volume, and how much of the aperture sees each."""
     at = samples(lock, *seen_volume(params))
     seen = np.zeros((len(at.points_mm), len(capture.sweeps)), np.float16)

@@ -4,27 +4,36 @@ Where the stage is, it asks the machine that the controller's simulator moves, n
 session believes and what the photographs show are independent of each other, as they are on a real rig.
 """
 
+import json
+import os
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
+from .capture import Capture, Sweep
 from .files import explain
 from .geometry import Optics
-from .groom import groom
+from .groom import Groom, groom
+from .progress import Progress, silent
 from .raw import Shot, read_planes, write_dng
 from .rig.camera import CameraSettings, CapturedFile, Tell, temporary
-from .rig.plan import Exposure, Place, Plan
-from .rig.session import Setup
-from .simulate import BLACK, WHITE, Drawing, SimulateParams, Studio, lock_params, prepare, studio
+from .rig.controller import Controller, ControllerConfig, stage_config, start_controller
+from .rig.plan import SWEEP, Exposure, Place, Plan
+from .rig.session import RIG, Orders, SessionParams, Setup, run
+from .rig.stage import Stage, StageConfig
+from .simulate import BLACK, JOURNAL, WHITE, Drawing, Scale, SimulateParams, Studio, begin, lock_params, prepare, studio, take_truth
 
-Where = Callable[[], tuple[Place, bool]]  # where the machine truly is, and whether it moves
-Photographer = Callable[[Place, CameraSettings, int], np.ndarray]  # place, settings, number of the shot -> mosaic (2H, 2W) uint16
+HAIR = f"{RIG}/virtual"
+Photographer = Callable[[Place, CameraSettings, int, bool], np.ndarray]
+"""Place, settings, number of the shot, and whether the stage moved meanwhile -> mosaic (2H, 2W) uint16."""
 STAMP = 6  # numbers in the first row of a stamped photograph
 BASE = 10_000
 
@@ -37,15 +46,38 @@ class VirtualCameraConfig:
     seed: int = 0
 
 
+class World(Protocol):
+    """The machine as it truly is."""
+
+    def place(self) -> Place:
+        """Where it stands."""
+
+    def moved(self, begin: float, end: float) -> bool:
+        """Whether it moved between two times of ``time.monotonic()``."""
+
+
+@dataclass(frozen=True)
+class SimulatedWorld:
+    """The machine that a simulated controller moves."""
+
+    controller: Controller
+    config: StageConfig
+
+    def place(self) -> Place:
+        return self.controller.place(self.config)
+
+    def moved(self, begin: float, end: float) -> bool:
+        return self.controller.moved(begin, end)
+
+
 class VirtualCamera:
     """A camera that renders what it sees; see ``rig.camera.Camera``."""
 
-    def __init__(self, photographer: Photographer, where: Where, config: VirtualCameraConfig = VirtualCameraConfig()):
-        self.photographer, self.where, self.config = photographer, where, config
+    def __init__(self, photographer: Photographer, world: World, config: VirtualCameraConfig = VirtualCameraConfig()):
+        self.photographer, self.world, self.config = photographer, world, config
         self.tell: Tell = lambda _line: None
         self.settings = CameraSettings(0.25, 2.8, 100)
-        self.shots = 0
-        self.moved = 0  # photographs during which the stage moved
+        self.shots: list[tuple[float, float]] = []  # when the shutter was open, in time.monotonic()
 
     def prepare(self, settings: CameraSettings) -> list[str]:
         self.settings = settings
@@ -57,19 +89,19 @@ class VirtualCamera:
     def capture(self, exposure: Exposure, folder: Path) -> CapturedFile:
         path = temporary(folder, exposure, ".dng")
         self.expose(path)
-        return CapturedFile(path, f"VIRT{self.shots:04d}.DNG")
+        return CapturedFile(path, f"VIRT{len(self.shots):04d}.DNG")
 
     def expose(self, path: Path) -> None:
         """Open the shutter now, and leave the photograph in ``path``."""
-        self.shots += 1
-        taken = datetime.now()
-        begin, moves = self.where()
+        taken, begin, place = datetime.now(), time.monotonic(), self.world.place()
         time.sleep(self.settings.shutter_s / self.config.time_factor)
-        end, still_moves = self.where()
-        mosaic = self.photographer(begin, self.settings, self.shots)
-        if moves or still_moves or begin != end:
-            self.moved += 1
-            mosaic = ((mosaic.astype(np.uint32) + self.photographer(end, self.settings, self.shots)) // 2).astype(np.uint16)
+        end, number = time.monotonic(), len(self.shots) + 1
+        self.shots.append((begin, end))
+        moved = self.world.moved(begin, end)
+        mosaic = self.photographer(place, self.settings, number, moved)
+        if moved:  # it shows both places
+            other = self.photographer(self.world.place(), self.settings, number, moved)
+            mosaic = ((mosaic.astype(np.uint32) + other) // 2).astype(np.uint16)
         try:
             write_dng(path, mosaic, BLACK, WHITE, Shot(taken, self.settings.shutter_s, self.settings.f_number))
         except OSError as error:
@@ -77,8 +109,7 @@ class VirtualCamera:
 
     def preview(self) -> np.ndarray:
         """The live picture (H, W) float32 of green: what is seen now."""
-        place, _ = self.where()
-        mosaic = self.photographer(place, self.settings, self.shots)
+        mosaic = self.photographer(self.world.place(), self.settings, len(self.shots), False)
         return (mosaic[::2, 1::2].astype(np.float32) - BLACK) / (WHITE - BLACK)
 
     def safe(self, captured: CapturedFile) -> None:
@@ -92,7 +123,7 @@ def photographer(camera: Studio) -> Photographer:
     """Photographs of a studio's hair at any place; the hair is turned and shaded once an angle."""
     lock, turned = threading.Lock(), lru_cache(4)(camera.at)
 
-    def take(place: Place, settings: CameraSettings, number: int) -> np.ndarray:
+    def take(place: Place, settings: CameraSettings, number: int, _moved: bool) -> np.ndarray:
         with lock:
             drawn: Drawing = turned(round(place.angle_deg, 3))
         rng = np.random.default_rng([camera.params.seed, 3, number, round(1000 * place.angle_deg) % 2**32, round(1000 * place.position_mm) % 2**32])
@@ -101,11 +132,12 @@ def photographer(camera: Studio) -> Photographer:
     return take
 
 
-def virtual_studio(params: SimulateParams) -> Studio:
-    """Simulated hair, ready to be photographed through optics that are as they should be."""
+def virtual_studio(params: SimulateParams, lock: Groom | None = None) -> Studio:
+    """Simulated hair (``lock``, or that of ``params``), ready to be photographed through optics that are as they should be."""
     scale = params.size
     optics = Optics(params.working_distance_mm, params.pitch_mm, (scale.columns - 1) / 2, (scale.rows - 1) / 2, params.aperture_cone_deg)
-    hair = prepare(groom(lock_params(params), np.random.default_rng([params.seed, 0])), np.random.default_rng([params.seed, 1]))
+    lock = lock or groom(lock_params(params), np.random.default_rng([params.seed, 0]))
+    hair = prepare(lock, np.random.default_rng([params.seed, 1]))
     return studio(params, optics, hair)
 
 
@@ -126,6 +158,61 @@ def virtual_setup(params: SimulateParams) -> Setup:
     return Setup(f"virtual {params.style} hair, seed {params.seed}", **optics)
 
 
+@dataclass(frozen=True)
+class VirtualParams:
+    """A virtual rig: which hair hangs on it, and how fast its time goes."""
+
+    hair: SimulateParams = field(default_factory=lambda: SimulateParams(scale="tiny"))
+    speed: float = 20.0  # its time passes so many times as fast
+
+
+def virtual_capture(
+    folder: Path,
+    params: VirtualParams = VirtualParams(),
+    plan: Plan | None = None,
+    session: SessionParams | None = None,
+    *,
+    repeat: tuple[int, ...] = (),
+    orders: Orders | None = None,
+    progress: Progress = silent,
+    events: Callable[[dict], None] = lambda _event: None,
+) -> Path:
+    """Take a capture of simulated hair with the driver and the session of a real one, its controller being a simulator's process.
+
+    ``plan`` None photographs all of the hair. ``truth.npz`` tells afterwards where the hair is. Raises as ``rig.session.run``.
+    """
+    folder, plan = Path(folder), plan or virtual_plan(params.hair)
+    begin(folder / HAIR, params.hair)  # another hair does not go into the same folder
+    lock = groom(lock_params(params.hair), np.random.default_rng([params.hair.seed, 0]))
+    camera_of = virtual_studio(params.hair, lock)
+    _truth(folder, plan, params.hair, lock, camera_of, progress)
+    config = ControllerConfig(time_factor=params.speed)
+    with start_controller(config) as controller:
+        place = stage_config(controller.url, config)
+        with Stage.open(place, lambda line: events({"event": "note", "message": line})) as stage:
+            camera = VirtualCamera(photographer(camera_of), SimulatedWorld(controller, place), VirtualCameraConfig(params.speed))
+            listeners = {"orders": orders, "progress": progress, "events": events}
+            return run(plan, stage, camera, folder, virtual_setup(params.hair), session or SessionParams(), repeat=repeat, **listeners)
+
+
+def hair_in(folder: Path) -> SimulateParams | None:
+    """The hair that a virtual capture in ``folder`` photographs, None where there is none."""
+    try:
+        told = json.loads((Path(folder) / HAIR / JOURNAL).read_text(encoding="utf-8"))
+        scale = told["scale"] if isinstance(told["scale"], str) else Scale(**told["scale"])
+        return SimulateParams(told["style"], scale, told["fibers"], told["seed"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _truth(folder: Path, plan: Plan, params: SimulateParams, lock: Groom, camera: Studio, progress: Progress) -> None:
+    sweeps = tuple(Sweep(angle, plan.positions_mm, ()) for angle in plan.angles_deg)
+    capture = Capture(folder, "", camera.optics, sweeps, truth="truth.npz")
+    if plan.kind == SWEEP and not capture.truth_path.is_file():
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            take_truth(capture, lock, camera.hair, params, progress, pool)
+
+
 # ---- photographs that tell where they were taken ---------------------------------------------------------------------
 
 
@@ -137,17 +224,14 @@ class Stamp:
     moving: bool
 
 
-def stamped(where: Where, rows: int = 24, columns: int = 32, seed: int | None = None) -> Photographer:
-    """Photographs (2 rows, 2 columns) of noise that say in their first row where the machine truly was: to prove captures with.
-
-    ``where`` is asked at the time of the shot, whether it moves.
-    """
+def stamped(rows: int = 24, columns: int = 32, seed: int | None = None) -> Photographer:
+    """Photographs (2 rows, 2 columns) of noise that say in their first row where the machine truly was: to prove captures with."""
     noise = np.random.default_rng(seed)
 
-    def take(place: Place, _settings: CameraSettings, number: int) -> np.ndarray:
+    def take(place: Place, _settings: CameraSettings, number: int, moved: bool) -> np.ndarray:
         mosaic = noise.integers(BLACK, BLACK + 3000, (2 * rows, 2 * columns)).astype(np.uint16)
         angle, position = round(1000 * place.angle_deg) + BASE * BASE // 2, round(1000 * place.position_mm) + BASE * BASE // 2
-        values = [*divmod(angle, BASE), *divmod(position, BASE), int(where()[1]), number % BASE]
+        values = [*divmod(angle, BASE), *divmod(position, BASE), int(moved), number % BASE]
         mosaic[0, : 2 * STAMP : 2] = np.array(values) + BLACK
         return mosaic
 

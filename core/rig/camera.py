@@ -399,6 +399,15 @@ class CableConfig:
     delete_originals: bool = False  # in the folder, once the session's copy is safe
 
 
+class Shutter(Protocol):
+    """The shutter line of a controller, as ``Stage`` has it."""
+
+    def pulse(self, seconds: float) -> None:
+        """On, and off again by itself after ``seconds``, whatever becomes of the connection."""
+
+    def output(self, on: bool) -> None: ...
+
+
 class CableCamera:
     """Any camera with a remote socket; see ``Camera``. Files that appear in a folder are matched to exposures.
 
@@ -409,18 +418,10 @@ class CableCamera:
     file is none that has the bytes of an earlier one, a number before it, or a time before the shot.
     """
 
-    def __init__(
-        self,
-        output: Callable[[bool], None],
-        watched: Path,
-        config: CableConfig = CableConfig(),
-        tell: Tell = lambda _line: None,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ):
-        """``output`` switches the shutter line, as ``Stage.output`` does; ``watched`` is the folder of the tethering software."""
-        self.output, self.watched, self.config, self.tell = output, Path(watched), config, tell
-        self._clock, self._sleep = clock, sleep
+    def __init__(self, shutter: Shutter, watched: Path, config: CableConfig = CableConfig(), tell: Tell = lambda _line: None):
+        """``watched`` is the folder of the tethering software."""
+        self.shutter, self.watched, self.config, self.tell = shutter, Path(watched), config, tell
+        self._pulsing = False  # a pulse was begun and is not known to have ended
         self._settings: CameraSettings | None = None
         self._known: set[Path] | None = None  # files that were looked at, or were there before
         self._hashes: set[str] = set()
@@ -442,6 +443,9 @@ class CableCamera:
             raise CameraGone(f"{self.watched}: the folder of the camera's photographs is not there; start the tethering software, or mount the card")
         if self._known is None:
             self._known = set(self._listed())
+        if self._pulsing:
+            self.shutter.output(False)
+            self._pulsing = False
         return []
 
     def capture(self, exposure: Exposure, folder: Path) -> CapturedFile:
@@ -477,9 +481,9 @@ class CableCamera:
         self._ignore(self._new(), "came without a shot")
         fired_at = time.time()
         self._outstanding += 1
-        self.output(True)
-        self._sleep(self.config.pulse_s)
-        self.output(False)
+        self._pulsing = True
+        self.shutter.pulse(self.config.pulse_s)
+        self._pulsing = False
         files = self._wait(self.config.wait_s + (self._settings.shutter_s if self._settings else 0.0), at_least=1)
         if not files:
             raise PhotographLate(
@@ -514,16 +518,16 @@ class CableCamera:
     def _wait(self, wait_s: float, at_least: int) -> list[Path]:
         """New photographs in the order they were taken: when ``at_least`` so many are there and nothing more came for a while, or what
         there is after ``wait_s``. Then a file that is still incomplete is given up."""
-        until, quiet_at, files = self._clock() + wait_s, -np.inf, []
+        until, quiet_at, files = time.monotonic() + wait_s, -np.inf, []
         while True:
             fresh = self._new()
             files += fresh
-            now = self._clock()
+            now = time.monotonic()
             if fresh:
                 quiet_at = now + self.config.quiet_s
             if now >= until or (len(files) >= at_least and now >= quiet_at and not self._incomplete):
                 break
-            self._sleep(self.config.poll_s)
+            time.sleep(self.config.poll_s)
         self._ignore(self._incomplete, "stays incomplete or cannot be read")
         self._known.update(self._incomplete)
         self._outstanding = max(self._outstanding - len(self._incomplete), 0)
@@ -534,7 +538,7 @@ class CableCamera:
         listed = [path for path in self._listed() if path not in self._known]
         sizes = [_size(path) for path in listed]
         if listed:
-            self._sleep(self.config.poll_s)
+            time.sleep(self.config.poll_s)
         complete = [path for path, size in zip(listed, sizes, strict=True) if size and _size(path) == size and _readable(path)]
         self._incomplete = [path for path in listed if path not in complete]
         self._known.update(complete)
@@ -571,9 +575,9 @@ class CableCamera:
         return [self.watched / n for n in names if not n.startswith(".") and Path(n).suffix.lower() in RAW_SUFFIXES | LINEAR_SUFFIXES]
 
 
-def cable_camera(output: Callable[[bool], None], watched: Path, config: CableConfig = CableConfig(), tell: Tell = lambda _line: None) -> CableCamera:
-    """A camera that the controller's output fires and whose photographs appear in the folder ``watched``."""
-    return CableCamera(output, watched, config, tell)
+def cable_camera(shutter: Shutter, watched: Path, config: CableConfig = CableConfig(), tell: Tell = lambda _line: None) -> CableCamera:
+    """A camera that a controller's output fires (``shutter``: a Stage) and whose photographs appear in the folder ``watched``."""
+    return CableCamera(shutter, watched, config, tell)
 
 
 def _order(path: Path) -> tuple:

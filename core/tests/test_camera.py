@@ -173,12 +173,16 @@ class Tether:
     def __init__(self, folder: Path):
         self.folder, self.number, self.how, self.timers = folder, 100, {}, []
         self.shots, self.values = 0, {}
+        self.now, self.fired = 0, {}  # the exposure that is taken; of which each shot was
         folder.mkdir()
 
     def output(self, on: bool) -> None:
-        if not on:
-            return
+        """It is off already."""
+        assert not on
+
+    def pulse(self, _seconds: float) -> None:
         self.shots += 1
+        self.fired[self.shots] = self.now
         self.number += 1
         how = self.how.get(self.shots, {})
         if how.get("lost"):
@@ -211,6 +215,13 @@ class Tether:
         return data
 
 
+class Dead:
+    """A shutter line that leads nowhere."""
+
+    def pulse(self, _seconds: float) -> None:
+        """Nothing happens."""
+
+
 @pytest.fixture
 def tether(tmp_path):
     tether = Tether(tmp_path / "tether")
@@ -237,7 +248,7 @@ def shoot(body, tether, tmp_path, count=4) -> list[int]:
 
 def test_the_first_shot_of_a_run_is_a_test_and_each_other_one_is_kept(tether, tmp_path):
     (tether.folder / "DSC_0001.dng").write_bytes(tether.photograph(0))  # of yesterday
-    body = cable_camera(tether.output, tether.folder, FAST)
+    body = cable_camera(tether, tether.folder, FAST)
     assert "set on the camera itself" in body.prepare(SETTINGS)[0]
     assert shoot(body, tether, tmp_path) == [2, 3, 4, 5]
 
@@ -259,19 +270,11 @@ def test_the_first_shot_of_a_run_is_a_test_and_each_other_one_is_kept(tether, tm
 )
 def test_whatever_comes_wrong_every_exposure_has_a_photograph_of_its_own_shots(tether, tmp_path, how):
     """A shot is one of the exposure that it was fired for: noted when it is fired."""
-    fired = {}
-    now = [0]
-
-    def output(on):
-        if on:
-            fired[tether.shots + 1] = now[0]
-        tether.output(on)
-
     tether.how = how
-    body = cable_camera(output, tether.folder, FAST)
+    body = cable_camera(tether, tether.folder, FAST)
     body.prepare(SETTINGS)
     for frame in range(4):
-        now[0] = frame
+        tether.now = frame
         for _ in range(5):
             try:
                 captured = body.capture(Exposure(frame, 0, frame, 0.0, 0.2 * frame, "sweep"), tmp_path)
@@ -282,15 +285,15 @@ def test_whatever_comes_wrong_every_exposure_has_a_photograph_of_its_own_shots(t
             raise AssertionError("no photograph")
         data = captured.path.read_bytes()
         shots = [shot for shot, value in tether.values.items() if value == data]
-        assert {fired[shot] for shot in shots} == {frame}
+        assert {tether.fired[shot] for shot in shots} == {frame}
 
 
 def test_originals_go_only_when_asked_for_and_safe(tether, tmp_path):
-    body = cable_camera(tether.output, tether.folder, FAST)
+    body = cable_camera(tether, tether.folder, FAST)
     body.prepare(SETTINGS)
     shoot(body, tether, tmp_path, 2)
     assert len(list(tether.folder.glob("*.dng"))) == 3
-    body = cable_camera(tether.output, tether.folder, CableConfig(**{**vars(FAST), "delete_originals": True}))
+    body = cable_camera(tether, tether.folder, CableConfig(**{**vars(FAST), "delete_originals": True}))
     body.prepare(SETTINGS)
     captured = body.capture(Exposure(0, 0, 0, 0.0, 0.0, "sweep"), tmp_path)
     assert captured.origin.exists()
@@ -300,8 +303,8 @@ def test_originals_go_only_when_asked_for_and_safe(tether, tmp_path):
 
 def test_a_folder_that_is_not_there_and_a_shutter_that_does_not_fire_are_told(tether, tmp_path):
     with pytest.raises(CameraGone, match="start the tethering software"):
-        cable_camera(tether.output, tmp_path / "nowhere", FAST).prepare(SETTINGS)
-    body = cable_camera(lambda _on: None, tether.folder, FAST)
+        cable_camera(tether, tmp_path / "nowhere", FAST).prepare(SETTINGS)
+    body = cable_camera(Dead(), tether.folder, FAST)
     body.prepare(SETTINGS)
     with pytest.raises(CameraError, match="is the shutter cable in"):
         body.capture(Exposure(0, 0, 0, 0.0, 0.0, "sweep"), tmp_path)

@@ -24,7 +24,7 @@ def studio() -> Studio:
 def taken(focus_mm: float, number: int = 1, moved_mm: float = 0.0, light: float = 1.0) -> np.ndarray:
     """Channel planes (3, H, W) of the lock, which has been moved to the right."""
     hair = replace(studio().hair, points_mm=studio().hair.points_mm + np.array([moved_mm, 0.0, 0.0]))
-    mosaic = photographer(replace(studio(), hair=hair))(Place(0.0, focus_mm), OPEN, number).astype(np.float32)
+    mosaic = photographer(replace(studio(), hair=hair))(Place(0.0, focus_mm), OPEN, number, False).astype(np.float32)
     mosaic = light * (mosaic - BLACK) / (WHITE - BLACK)
     return np.clip(np.stack([mosaic[::2, ::2], (mosaic[::2, 1::2] + mosaic[1::2, ::2]) / 2, mosaic[1::2, 1::2]]), 0, 1)
 

@@ -1,0 +1,112 @@
+"""A rig as a file describes it, and a capture with it: what the command line and the panel call.
+
+The TOML file has the tables ``plan``, ``stage``, ``camera`` and ``optics``. A capture keeps its own in ``rig/rig.toml``, so that
+it is gone on with by naming its folder alone.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+
+from ..errors import StrandscopeError
+from ..progress import Progress, silent
+from .camera import CableConfig, Camera, GphotoConfig, cable_camera, gphoto_camera
+from .plan import Plan, load_plan, read_table, save_plan
+from .session import RIG, Orders, SessionParams, Setup, run
+from .stage import Stage, StageConfig, load_stage
+
+USB, CABLE = "usb", "cable"
+FILE = f"{RIG}/rig.toml"
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """Which camera, and how it is spoken to."""
+
+    kind: str = USB  # through libgphoto2; or "cable": fired by the controller, its photographs appear in a folder
+    folder: str = ""  # where they appear, for a cable
+    usb: GphotoConfig = field(default_factory=GphotoConfig)
+    cable: CableConfig = field(default_factory=CableConfig)
+
+
+@dataclass(frozen=True)
+class Rig:
+    """All that a file says of a rig."""
+
+    plan: Plan = field(default_factory=Plan)
+    stage: StageConfig = field(default_factory=StageConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    setup: Setup = field(default_factory=Setup)
+
+
+def load_rig(path: Path) -> Rig:
+    """A rig from a TOML file; what is not there has its default. Raises StrandscopeError naming file and field."""
+    path = Path(path)
+    camera = read_table(path, "camera")
+    kind, folder = camera.pop("kind", USB), camera.pop("folder", "")
+    if kind not in (USB, CABLE):
+        raise StrandscopeError(f'{path}: camera.kind is {kind!r}; expected "{USB}" or "{CABLE}"')
+    if not isinstance(folder, str) or (kind == CABLE) != bool(folder):
+        expected = "the folder in which the camera's photographs appear" if kind == CABLE else f'none, but with kind "{CABLE}"'
+        raise StrandscopeError(f"{path}: camera.folder is {folder!r}; expected {expected}")
+    way = {USB: "usb", CABLE: "cable"}[kind]
+    config = replace(CameraConfig(kind, folder), **{way: _filled(path, "camera", camera, GphotoConfig() if kind == USB else CableConfig())})
+    return Rig(load_plan(path), load_stage(path), config, _filled(path, "optics", read_table(path, "optics"), Setup()))
+
+
+def save_rig(path: Path, rig: Rig) -> None:
+    """Write a rig, atomically, so that ``load_rig`` reads it."""
+    camera = {"kind": rig.camera.kind} | asdict(rig.camera.usb if rig.camera.kind == USB else rig.camera.cable)
+    if rig.camera.kind == CABLE:
+        camera["folder"] = rig.camera.folder
+    optics = {name: value for name, value in asdict(rig.setup).items() if value is not None}
+    save_plan(path, rig.plan, stage=asdict(rig.stage), camera=camera, optics=optics)
+
+
+def open_camera(config: CameraConfig, stage: Stage) -> Camera:
+    """The camera of a rig, not connected yet. Raises StrandscopeError where libgphoto2 is needed and not installed."""
+    if config.kind == CABLE:
+        return cable_camera(stage, Path(config.folder).expanduser(), config.cable)
+    return gphoto_camera(config.usb)
+
+
+def capture(
+    rig: Rig | None,
+    folder: Path,
+    params: SessionParams | None = None,
+    *,
+    repeat: tuple[int, ...] = (),
+    orders: Orders | None = None,
+    progress: Progress = silent,
+    events: Callable[[dict], None] = lambda _event: None,
+) -> Path:
+    """Take a capture with a rig, or go on with the one in ``folder`` (``rig`` None). Returns the path of capture.json; raises as
+    ``session.run`` does, and StageLost where no controller answers."""
+    folder = Path(folder)
+    plan = None if rig is None else rig.plan
+    if rig is None:
+        rig = load_rig(folder / FILE)
+    else:
+        save_rig(folder / FILE, rig)
+    with Stage.open(rig.stage, lambda line: events({"event": "note", "message": line})) as stage:
+        for line in stage.complaints(rig.plan):
+            events({"event": "warning", "message": line})
+        camera = open_camera(rig.camera, stage)
+        try:
+            return run(
+                plan, stage, camera, folder, rig.setup, params or SessionParams(), repeat=repeat, orders=orders, progress=progress, events=events
+            )
+        finally:
+            camera.close()
+
+
+def _filled(path: Path, table: str, values: dict, start):
+    """A dataclass with the values of a table, each of the type that it has at first; None stands for a number."""
+    known = {f.name: getattr(start, f.name) for f in fields(start)}
+    for name, value in values.items():
+        if name not in known:
+            raise StrandscopeError(f"{path}: {table}.{name} is not a field; expected one of {', '.join(known)}")
+        expected = {str: "text", bool: "true or false"}.get(type(known[name]), "a number")
+        if {str: "text", bool: "true or false", int: "a number", float: "a number"}.get(type(value)) != expected:
+            raise StrandscopeError(f"{path}: {table}.{name} is {value!r}; expected {expected}")
+    return replace(start, **values)
