@@ -208,12 +208,13 @@ class Lines:
 @dataclass(frozen=True)
 class Track:
     """What is known of state and place after the messages so far. ``machine`` (n,) in the controller's units is None as long as
-    it cannot be told: before the first report, and with work coordinates before their offset was heard."""
+    it cannot be told: before the first report, and with work coordinates before their offset was heard twice alike."""
 
     state: str = ""
     substate: int | None = None
     machine: tuple[float, ...] | None = None
     offset: tuple[float, ...] | None = None
+    told: tuple[float, ...] | None = None  # the last offset that was heard, perhaps not as it was said
     alike: int = 0  # whole reports of this state at this place, one after the other
     pins: str = ""
     feed: float | None = None
@@ -228,7 +229,8 @@ def follow(track: Track, message: Message) -> Track:
     """The track after one more message. Garbage may have been a report that told another offset or place: it is told anew."""
     match message:
         case Report():
-            offset = message.offset or track.offset
+            told = message.offset or track.told
+            offset = track.offset if message.offset is None else told if told == track.told else None
             machine = message.machine
             if message.work and offset and len(offset) == len(message.work):
                 machine = tuple(w + o for w, o in zip(message.work, offset, strict=True))
@@ -238,6 +240,7 @@ def follow(track: Track, message: Message) -> Track:
                 message.substate,
                 machine,
                 offset,
+                told,
                 track.alike + 1 if same else int(machine is not None),
                 message.pins,
                 message.feed,
