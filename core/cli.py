@@ -10,7 +10,7 @@ import re
 import sys
 import traceback
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import click
@@ -392,6 +392,87 @@ def _parameters(preset, params, method, infill, no_infill):
     if no_infill:
         return replace(parameters, infill=None)
     return parameters if infill is None else replace(parameters, infill=replace(parameters.infill or pipeline.InfillParams(), count=infill))
+
+
+@main_group.command(short_help="Photograph hair with a rig: hours, survived.")
+@click.argument("plan", type=PATH, required=False, metavar="[PLAN.toml]")
+@click.option("-o", "--output", "folder", type=PATH, metavar="CAPTURE", help="The capture to make, or to go on with: a folder.")
+@click.option("--virtual", is_flag=True, help="With a simulated controller, camera and lock of hair.")
+@click.option("--port", metavar="URL", help="Of the controller: /dev/ttyUSB0, COM3, socket://host:port, …  [default: that of the plan]")
+@click.option("--watch", type=PATH, metavar="FOLDER", help="The controller fires the camera by cable; its photographs appear in this folder.")
+@click.option("--name", help="What is photographed.  [default: the folder's name]")
+@click.option("--repeat-sweep", "repeat", type=click.IntRange(0), multiple=True, metavar="N", help="Take sweep N anew; may be given again.")
+@click.option("--patience", type=click.FloatRange(min=0), default=1800.0, show_default=True, metavar="S", help="Wait so long for what is away.")
+@click.option("--status", "order", flag_value="status", help="Say how far the capture is, and end.")
+@click.option("--pause", "order", flag_value="pause", help="Ask the run that takes CAPTURE to pause after this photograph.")
+@click.option("--resume", "order", flag_value="resume", help="Ask it to go on.")
+@click.option("--abort", "order", flag_value="abort", help="Ask it to end after this photograph; it can be gone on with.")
+@click.option("--dry-run", is_flag=True, help="Say what the plan costs, and end.")
+@click.option("--style", type=click.Choice(["straight", "wavy", "curls"]), default="straight", show_default=True, help="Virtual hair.")
+@click.option("--scale", type=click.Choice(["tiny", "small", "medium"]), default="tiny", show_default=True, help="Size of the virtual capture.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Another number gives another virtual lock.")
+@click.option("--speed", type=POSITIVE, default=20.0, show_default=True, help="The virtual rig's time goes so many times as fast.")
+@common
+@click.pass_obj
+def capture(session, plan, folder, virtual, port, watch, name, repeat, patience, order, dry_run, style, scale, seed, speed):
+    """Photograph hair with a rig: a camera on a stage, and a turntable, on a GRBL or grblHAL controller.
+
+    PLAN.toml says what to photograph, and how the rig is wired; without it, the capture in CAPTURE is gone on with. Every
+    photograph is proven safe before the next is taken, so a run may end in any way: run it again. Ctrl-C ends it after the
+    photograph that is being taken, a second Ctrl-C at once.
+
+    \b
+    Examples:
+      strandscope capture --virtual -o lock
+      strandscope capture switch.toml -o switch --port /dev/ttyUSB0
+      strandscope capture -o switch
+      strandscope capture --pause -o switch
+    """
+    from .rig import operate
+    from .rig import session as runs
+
+    report = session.report
+    if order and folder is None:  # `capture --status FOLDER`
+        plan, folder = None, plan
+    if folder is None and not dry_run:
+        raise click.UsageError("missing option '-o': the folder of the capture")
+    if order == "status":
+        told = runs.status(folder)
+        report.event(told)
+        report.show(terminal.table(runs.describe(told)))
+        return
+    if order:
+        runs.order(folder, order)
+        return
+    if repeat and not plan and runs.runs(folder):
+        for sweep in repeat:
+            runs.order(folder, runs.REPEAT, sweep=sweep)
+        return
+    params = runs.SessionParams(patience_s=patience)
+    orders = runs.Orders()
+    work = {"repeat": repeat, "orders": orders, "progress": report, "events": report.event}
+    from . import virtual_rig
+
+    hair = virtual_rig.hair_in(folder) if folder and not plan else None
+    if virtual or hair:
+        from .simulate import SimulateParams
+
+        hair = hair or SimulateParams(style, scale, seed=seed)
+        rig = operate.Rig(plan=operate.load_rig(plan).plan if plan else virtual_rig.virtual_plan(hair))
+        take = partial(virtual_rig.virtual_capture, folder, virtual_rig.VirtualParams(hair, speed), rig.plan, params, **work)
+    else:
+        rig = operate.load_rig(plan) if plan else operate.load_rig(folder / operate.FILE) if folder else operate.Rig()
+        rig = operate.changed(rig, port, watch, name)
+        take = partial(operate.capture, rig, folder, params, **work)
+    report.show(terminal.table(operate.describe(rig.plan)))
+    if dry_run:
+        return
+    with terminal.stops_politely(lambda: orders.add(runs.ABORT), report.note):
+        try:
+            made = take()
+        except runs.RunStopped as stopped:  # the run has said so
+            raise click.exceptions.Exit(INTERRUPTED) from stopped
+    report.done(made)
 
 
 @main_group.command(short_help="Find the hairs in a capture, write them as curves.")

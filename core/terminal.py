@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -169,6 +169,29 @@ def interruptible() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)  # None: not of Python, as in Blender
+
+
+@contextmanager
+def stops_politely(stop: Callable[[], None], note: Callable[[str], None]) -> Iterator[None]:
+    """The first Ctrl-C, or request to end, calls ``stop``, which must be quick; a second one interrupts."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handler(_number, _frame):
+        for number in before:
+            signal.signal(number, signal.default_int_handler)
+        stop()
+        note("ending after this photograph; once more: at once")
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number in before:
+        signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, signal.SIG_DFL if old is None else old)
 
 
 def stop_with_parent() -> None:

@@ -28,7 +28,8 @@ from .rig.camera import CameraSettings, CapturedFile, Tell, temporary
 from .rig.controller import Controller, ControllerConfig, stage_config, start_controller
 from .rig.plan import SWEEP, Exposure, Place, Plan
 from .rig.session import RIG, Orders, SessionParams, Setup, run
-from .rig.stage import Stage, StageConfig
+from .rig.stage import Stage
+from .rig.wiring import StageConfig
 from .simulate import BLACK, JOURNAL, WHITE, Drawing, Scale, SimulateParams, Studio, begin, lock_params, prepare, studio, take_truth
 
 HAIR = f"{RIG}/virtual"

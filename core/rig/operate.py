@@ -11,9 +11,10 @@ from pathlib import Path
 from ..errors import StrandscopeError
 from ..progress import Progress, silent
 from .camera import CableConfig, Camera, GphotoConfig, cable_camera, gphoto_camera
-from .plan import Plan, load_plan, read_table, save_plan
-from .session import RIG, Orders, SessionParams, Setup, run
-from .stage import Stage, StageConfig, load_stage
+from .plan import CHECK, Plan, load_plan, read_table, save_plan
+from .session import RIG, Orders, SessionParams, Setup, duration, run
+from .stage import Stage
+from .wiring import StageConfig, load_stage
 
 USB, CABLE = "usb", "cable"
 FILE = f"{RIG}/rig.toml"
@@ -63,6 +64,28 @@ def save_rig(path: Path, rig: Rig) -> None:
     save_plan(path, rig.plan, stage=asdict(rig.stage), camera=camera, optics=optics)
 
 
+def changed(rig: Rig, port: str | None = None, watched: Path | None = None, name: str | None = None) -> Rig:
+    """The rig with another port, the folder that a camera on a cable delivers to, another name of what is photographed."""
+    if port:
+        rig = replace(rig, stage=replace(rig.stage, url=port))
+    if watched:
+        rig = replace(rig, camera=replace(rig.camera, kind=CABLE, folder=str(Path(watched).resolve())))
+    return replace(rig, setup=replace(rig.setup, name=name)) if name else rig
+
+
+def describe(plan: Plan) -> list[tuple[str, str]]:
+    """Rows (name, value) for people: what a plan costs."""
+    checks = sum(e.kind == CHECK for e in plan.exposures())
+    angles = plan.angles_deg
+    return [
+        ("photographs", f"{len(plan)}, of which {checks} are checks" if checks else f"{len(plan)}"),
+        ("angles", f"{len(angles)}, from {min(angles):g}° to {max(angles):g}°"),
+        ("positions", f"{plan.count}, from {plan.first_mm:g} mm to {plan.last_mm:g} mm"),
+        ("time", duration(plan.duration_s())),
+        ("disk", f"{plan.disk_bytes() / 1e9:.1f} GB"),
+    ]
+
+
 def open_camera(config: CameraConfig, stage: Stage) -> Camera:
     """The camera of a rig, not connected yet. Raises StrandscopeError where libgphoto2 is needed and not installed."""
     if config.kind == CABLE:
@@ -71,7 +94,7 @@ def open_camera(config: CameraConfig, stage: Stage) -> Camera:
 
 
 def capture(
-    rig: Rig | None,
+    rig: Rig,
     folder: Path,
     params: SessionParams | None = None,
     *,
@@ -80,22 +103,17 @@ def capture(
     progress: Progress = silent,
     events: Callable[[dict], None] = lambda _event: None,
 ) -> Path:
-    """Take a capture with a rig, or go on with the one in ``folder`` (``rig`` None). Returns the path of capture.json; raises as
-    ``session.run`` does, and StageLost where no controller answers."""
+    """Take a capture with a rig, or go on with it. Returns the path of capture.json; raises as ``session.run`` does, and StageLost
+    where no controller answers."""
     folder = Path(folder)
-    plan = None if rig is None else rig.plan
-    if rig is None:
-        rig = load_rig(folder / FILE)
-    else:
-        save_rig(folder / FILE, rig)
+    save_rig(folder / FILE, rig)
     with Stage.open(rig.stage, lambda line: events({"event": "note", "message": line})) as stage:
         for line in stage.complaints(rig.plan):
             events({"event": "warning", "message": line})
         camera = open_camera(rig.camera, stage)
         try:
-            return run(
-                plan, stage, camera, folder, rig.setup, params or SessionParams(), repeat=repeat, orders=orders, progress=progress, events=events
-            )
+            listeners = {"orders": orders, "progress": progress, "events": events}
+            return run(rig.plan, stage, camera, folder, rig.setup, params or SessionParams(), repeat=repeat, **listeners)
         finally:
             camera.close()
 

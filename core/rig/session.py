@@ -158,6 +158,31 @@ def status(folder: Path) -> dict:
     return {**last, "event": "capture", "running": running, "done": len(story.safe), "total": total}
 
 
+def runs(folder: Path) -> bool:
+    """Whether a run takes the capture in ``folder`` now."""
+    return is_held(Path(folder) / LOCK)
+
+
+def describe(told: dict) -> list[tuple[str, str]]:
+    """Rows (name, value) for people of what ``status`` tells."""
+    rows = [("photographs", f"{told['done']} of {told['total']} safe"), ("state", told.get("state", "begun") if told["running"] else "no run")]
+    if not told["running"] and "state" in told:
+        rows.append(("last run", told["state"]))
+    if "sweep" in told:
+        rows.append(("last", f"{told['kind']} {told['sweep']}, photograph {told['frame']}, at {told['angle_deg']:g}°, {told['position_mm']:g} mm"))
+    if told["running"] and "remaining_s" in told:
+        rows.append(("remaining", duration(told["remaining_s"])))
+    if told.get("message"):
+        rows.append(("said", told["message"]))
+    return rows
+
+
+def duration(seconds: float) -> str:
+    """Hours and minutes, or minutes and seconds."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min {rest:02d} s"
+
+
 # ---- what the logbook says -------------------------------------------------------------------------------------------
 
 
