@@ -407,6 +407,7 @@ def _parameters(preset, params, method, infill, no_infill):
 @click.option("--pause", "order", flag_value="pause", help="Ask the run that takes CAPTURE to pause after this photograph.")
 @click.option("--resume", "order", flag_value="resume", help="Ask it to go on.")
 @click.option("--abort", "order", flag_value="abort", help="Ask it to end after this photograph; it can be gone on with.")
+@click.option("--live", type=PATH, metavar="PICTURE.png", help="Show what the camera sees, again and again, and how sharp it is; for focusing.")
 @click.option("--dry-run", is_flag=True, help="Say what the plan costs, and end.")
 @click.option("--style", type=click.Choice(["straight", "wavy", "curls"]), default="straight", show_default=True, help="Virtual hair.")
 @click.option("--scale", type=click.Choice(["tiny", "small", "medium"]), default="tiny", show_default=True, help="Size of the virtual capture.")
@@ -414,7 +415,7 @@ def _parameters(preset, params, method, infill, no_infill):
 @click.option("--speed", type=POSITIVE, default=20.0, show_default=True, help="The virtual rig's time goes so many times as fast.")
 @common
 @click.pass_obj
-def capture(session, plan, folder, virtual, port, watch, name, repeat, patience, order, dry_run, style, scale, seed, speed):
+def capture(session, plan, folder, virtual, port, watch, name, repeat, patience, order, live, dry_run, style, scale, seed, speed):
     """Photograph hair with a rig: a camera on a stage, and a turntable, on a GRBL or grblHAL controller.
 
     PLAN.toml says what to photograph, and how the rig is wired; without it, the capture in CAPTURE is gone on with. Every
@@ -434,6 +435,9 @@ def capture(session, plan, folder, virtual, port, watch, name, repeat, patience,
     report = session.report
     if order and folder is None:  # `capture --status FOLDER`
         plan, folder = None, plan
+    if live:
+        camera = operate.open_camera(operate.load_rig(plan).camera if plan else operate.CameraConfig())
+        operate.live(camera, live, report.event)
     if folder is None and not dry_run:
         raise click.UsageError("missing option '-o': the folder of the capture")
     if order == "status":

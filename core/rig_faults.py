@@ -187,8 +187,8 @@ class _Trial:
             while True:
                 if self.child is None or self.child.poll() is not None:
                     if self.child is not None and self.child.returncode == 0:
-                        late = [fault for _, fault in left] + [(self.folder / "camera").read_text()] * (self.folder / "camera").exists()
-                        return [f"{fault} came too late" for fault in late]
+                        late = [fault for _, fault in left] + [_camera_fault(self.folder)]
+                        return [f"{fault} came too late" for fault in late if fault]
                     if self.starts == MOST_STARTS:
                         return [f"the session ended {MOST_STARTS} times: {self._said()}"]
                     self._start()
@@ -398,3 +398,25 @@ def _fill_disk(full: Path) -> None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (2000 if now else hard, hard))
             was = now
         time.sleep(0.01)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """``python -m strandscope.core.rig_faults FOLDER``: inject faults, and print what came of them. 1 if a capture is not proven."""
+    import argparse
+
+    parser = argparse.ArgumentParser(prog="rig_faults", description="Virtual captures with faults, and a proof of what is left of them.")
+    parser.add_argument("folder", type=Path, help="where captures are made; those that are not proven stay there")
+    parser.add_argument("--faults", type=int, default=FaultParams.faults, help="how many, in all")
+    parser.add_argument("--seed", type=int, default=0, help="another number gives other moments")
+    given = parser.parse_args(argv)
+    done = []
+    for trial in trials(given.folder, FaultParams(given.faults, seed=given.seed)):
+        done.append(trial)
+        name, what = describe([trial])[0]
+        print(f"{name}  {what}", flush=True)
+    print("\n".join(f"{name:<10}{what}" for name, what in describe(done)[-3:]))
+    return int(any(trial.wrong for trial in done))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -10,10 +10,11 @@ from pathlib import Path
 
 from ..errors import StrandscopeError
 from ..progress import Progress, silent
-from .camera import CableConfig, Camera, GphotoConfig, cable_camera, gphoto_camera
+from .camera import CableConfig, Camera, CameraError, GphotoConfig, cable_camera, gphoto_camera
 from .plan import CHECK, Plan, load_plan, read_table, save_plan
 from .session import RIG, Orders, SessionParams, Setup, duration, run
 from .stage import Stage
+from .watch import sharpness, write_picture
 from .wiring import StageConfig, load_stage
 
 USB, CABLE = "usb", "cable"
@@ -116,6 +117,20 @@ def capture(
             return run(rig.plan, stage, camera, folder, rig.setup, params or SessionParams(), repeat=repeat, **listeners)
         finally:
             camera.close()
+
+
+def live(camera: Camera, picture: Path, events: Callable[[dict], None], stop: Callable[[], bool] = lambda: False) -> None:
+    """Show what the camera sees, for framing and focusing, until ``stop``: the picture in a file, its sharpness as an event each.
+
+    Raises CameraError where the camera has no live picture.
+    """
+    if not hasattr(camera, "preview"):
+        raise CameraError("a camera on a cable has no live picture here; frame and focus on its own screen")
+    while not stop():
+        seen = camera.preview()
+        write_picture(picture, seen)
+        number = round(sharpness(seen), 4)
+        events({"event": "live", "sharpness": number, "picture": str(picture), "message": f"sharpness {number:.4f}"})
 
 
 def _filled(path: Path, table: str, values: dict, start):

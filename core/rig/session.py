@@ -34,12 +34,14 @@ from . import logbook
 from .camera import Camera, CameraAsleep, CameraError, CameraGone, CapturedFile, settings_of
 from .logbook import Logbook
 from .plan import CHECK, TURNTABLE, Exposure, Plan
-from .stage import Place, PositionLost, Stage, StageError, StageLost
-from .watch import Sight, Watch, WatchParams, look
+from .stage import Place, PositionLost, Stage, StageAlarm, StageError, StageLost
+from .watch import Sight, Watch, WatchParams, look, write_picture
 
 RIG = "rig"
 LOGBOOK, EVENTS, ORDERS = f"{RIG}/logbook.jsonl", f"{RIG}/events.jsonl", f"{RIG}/orders.jsonl"
 LOCK, ASIDE, INCOMING = f"{RIG}/lock", f"{RIG}/aside", f"{RIG}/incoming"
+LAST = f"{RIG}/last.png"  # the last photograph, small, for those who watch
+LAST_EVERY_S = 1.0
 PAUSE, RESUME, ABORT, REPEAT = "pause", "resume", "abort", "repeat"
 STILL_MM, STILL_DEG = 0.005, 0.02  # nearer than this to its place the stage stands there
 STOPS_OFF = 0.4  # an exposure that differs by more, in factors of two, is another
@@ -325,7 +327,7 @@ class _Run:
         self.watch = Watch(params.watch, self.story.setup.pitch_mm)
         self.hashes = {record["sha256"]: key for key, record in self.story.safe.items()}
         self.pace: deque[float] = deque(maxlen=REMEMBERED)
-        self.paused = False
+        self.paused, self.shown = False, -math.inf
         self.ready = self.prepared = False
         self.failing: StrandscopeError | None = None  # the trouble that lasts, since when, and how often it was met
         self.failing_since, self.tries = 0.0, 0
@@ -385,6 +387,9 @@ class _Run:
             self._note_down("homed", **_place(self.stage.home()))
         elif isinstance(self.failing, StageError):
             kept = self.stage.recover(self.params.retry_s)
+            if kept and isinstance(self.failing, StageAlarm) and self.stage.config.homing:
+                kept = False  # no plan asks for an alarm: what led to it may have moved the stage, whatever the controller counts
+                self.stage.home()
             self._note_down("recovered", kept=kept, **_place(self.stage.position()))
             self.note("the controller is there again" + ("" if kept else ", homed"))
         if not self.prepared:
@@ -472,6 +477,7 @@ class _Run:
         record = self._note_down("safe", **what, **told)
         self.story.safe[key(exposure)] = record
         self.hashes[digest] = key(exposure)
+        self._show(planes)
         if self._sweep_complete(exposure):
             warnings += self.watch.sweep_done(self.plan.count)
             derive(self.folder, self.story)
@@ -499,6 +505,12 @@ class _Run:
         if exposure.kind == CHECK:
             return look(planes), self.watch.check(planes)
         return self.watch.photograph(exposure.sweep, exposure.frame, exposure.position_mm, planes)
+
+    def _show(self, planes: np.ndarray) -> None:
+        if self.clock() - self.shown > LAST_EVERY_S:
+            self.shown = self.clock()
+            with suppress(StrandscopeError):  # the disk is full; that is told where it matters
+                write_picture(self.folder / LAST, planes)
 
     def _sweep_complete(self, exposure: Exposure) -> bool:
         """Whether this was the last photograph of its sweep that was missing."""

@@ -7,16 +7,20 @@ drifts, hair that moved. Each warning says what to do.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 
-from .calibrate import BLOCK_PX, drift, gains, light
+from ..files import atomic
+from ..raw import reduced
+from .calibrate import BLOCK_PX, BOARD_SHARE, drift, gains, light
 
 WHITE_NEAR = 0.98  # of white: clipped, in spite of noise and of white levels that are a little off
 FINE_PX = (0.8, 1.6)  # sigmas of the band in which what is in focus differs most from what is not
 TILE_PX = 96  # of the pictures that are compared for motion
 LEAST_TEXTURE = 1e-4  # mean square of the gradient along a direction, over the light's, that tells motion along it
+SAME_HUE = 0.01  # of the share of blue: the same board
 SURE = 5.0  # motion of so many standard errors is one
 
 
@@ -27,6 +31,7 @@ class WatchParams:
     clipped: float = 0.002  # share of pixels at white
     faint: float = 0.08  # of white: the brightest hundredth is darker
     contrast: float = 1.5  # sharpest photograph of a sweep over its least sharp: less, and nothing came into focus
+    unsharp: float = 0.12  # and no photograph with so little sharpness has anything in focus
     open_end: float = 0.6  # of the way from least to most sharp, at the ends of a sweep: the hair goes on there
     light_drift: float = 0.02  # parts, within a sweep
     light_change: float = 0.04  # parts, from the first sweep
@@ -63,6 +68,16 @@ def sharpness(plane: np.ndarray) -> float:
     """
     fine = ndimage.gaussian_filter(plane, FINE_PX[0]) - ndimage.gaussian_filter(plane, FINE_PX[1])
     return float(np.percentile(np.abs(fine), 98) / max(float(plane.mean()), 1e-4))
+
+
+def write_picture(path: Path, planes: np.ndarray, widest_px: int = 800) -> None:
+    """Channel planes R, G, B (3, H, W), or one plane (H, W), as a small picture for people (.png, .jpg); atomically."""
+    from PIL import Image
+
+    seen = reduced(planes if planes.ndim == 3 else planes[None], -(-planes.shape[-1] // widest_px))
+    numbers = np.clip(255 * np.clip(seen, 0, 1) ** (1 / 2.2) + 0.5, 0, 255).astype(np.uint8)
+    with atomic(path) as part:
+        Image.fromarray(np.moveaxis(numbers, 0, -1) if len(numbers) == 3 else numbers[0]).save(part)
 
 
 @dataclass(frozen=True)
@@ -145,7 +160,7 @@ class Watch:
     sights: dict[int, Sight] = field(default_factory=dict)
     positions_mm: dict[int, float] = field(default_factory=dict)
     first: np.ndarray | None = None  # red of the first photograph of the sweep
-    board: np.ndarray | None = None  # light of the first sweep's photographs, mean over them
+    board: tuple[float, float] | None = None  # light of the board in the first sweep, and how blue it was
     told: set[str] = field(default_factory=set)
 
     def photograph(self, sweep: int, frame: int, position_mm: float, planes: np.ndarray) -> tuple[Sight, list[str]]:
@@ -203,7 +218,7 @@ class Watch:
         p, frames = self.params, sorted(self.sights)
         sharp = np.array([self.sights[frame].sharpness for frame in frames])
         low, high = float(np.percentile(sharp, 10)), float(sharp.max())
-        if high < p.contrast * low:
+        if high < min(p.contrast * low, p.unsharp):
             span = f"{self.positions_mm[frames[0]]:g} … {self.positions_mm[frames[-1]]:g} mm"
             return [
                 f"nothing came into focus in sweep {self.sweep}: does the range, {span}, "
@@ -226,14 +241,18 @@ class Watch:
                 f"the light changed by {100 * change:+.1f} % during sweep {self.sweep}: let the lamps warm up, and keep daylight out "
                 "(`strandscope calibrate` takes such a drift out again)"
             )
-        mean = stack.mean(axis=0)
-        bluest = mean[2] >= np.percentile(mean[2] / np.maximum(mean.sum(axis=0), 1e-9), 90) * mean.sum(axis=0)
-        level = mean.sum(axis=0)[bluest].mean()
+        mean = np.median(stack, axis=0).reshape(3, -1)
+        blue = mean[2] / np.maximum(mean.sum(axis=0), 1e-9)
+        board = np.argsort(-blue)[: max(int(BOARD_SHARE * len(blue)), 4)]
+        level, hue = float(mean[:, board].sum(axis=0).mean()), float(blue[board].mean())
         if self.board is None:
-            self.board = np.array(level)
-        elif abs(level / self.board - 1) > p.light_change and "light" not in self.told:
+            self.board = (level, hue)
+            return warnings
+        level = level / self.board[0]
+        same = abs(hue - self.board[1]) < SAME_HUE  # else hair is before it
+        if same and abs(level - 1) > p.light_change and "light" not in self.told:
             self.told.add("light")
-            change = f"{100 * (level / self.board - 1):+.1f} %"
+            change = f"{100 * (level - 1):+.1f} %"
             warnings.append(
                 f"the light of sweep {self.sweep} differs by {change} from that of the first: has a lamp changed, or the "
                 "camera's exposure? Put it right, and repeat the sweep"

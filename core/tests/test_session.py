@@ -17,6 +17,7 @@ from strandscope.core.rig.logbook import Logbook, read
 from strandscope.core.rig.plan import Place, Plan, turntable_plan
 from strandscope.core.rig.session import ABORT, PAUSE, REPEAT, RESUME, Orders, RunStopped, SessionParams, run
 from strandscope.core.rig.stage import PositionLost, StageAlarm, StageLost
+from strandscope.core.rig.wiring import StageConfig
 from strandscope.core.virtual_rig import VirtualCamera, VirtualCameraConfig, read_stamp, stamped
 
 PLAN = Plan(angles_deg=(0.0, 120.0), first_mm=-0.2, step_mm=0.2, count=3, settle_s=0.0, shutter_s=0.001, bytes_each=8000)
@@ -26,7 +27,7 @@ QUICK = SessionParams(retry_s=0.0, patience_s=5.0, reserve_bytes=0)
 class SteadyStage:
     """A stage in memory that goes where it is told; faults are raised by what is asked next."""
 
-    known = True
+    known, config = True, StageConfig()
 
     def __init__(self):
         self.at, self.faults, self.asked = Place(0.0, 0.0), [], []
@@ -234,6 +235,7 @@ def test_a_controller_that_goes_away_is_waited_for(tmp_path, rig, where, fault):
     run(PLAN, stage, camera, tmp_path, params=QUICK)
     expect_whole(tmp_path, PLAN)
     assert "recover" in stage.asked
+    assert stage.asked.count("home") == (2 if isinstance(fault, StageAlarm) else 1)  # after an alarm, in any case
     if where == "position":  # the exposure was made, and is not trusted
         assert len(camera.shots) == len(PLAN) + 1
 
