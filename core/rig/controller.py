@@ -17,7 +17,7 @@ import math
 import os
 import random
 import re
-import selectors
+import select
 import socket
 import subprocess
 import sys
@@ -46,7 +46,26 @@ TICK_S, IDLE_S = 0.002, 0.02  # of real time between two looks at the port
 
 _LINEAR = {100: 400.0, 110: 900.0, 120: 60.0, 130: MAX_LINEAR}
 _ROTARY = {100: 40.0, 110: 3600.0, 120: 400.0, 130: MAX_ROTARY}
-_COMMON = {0: 10, 1: 255, 2: 0, 3: 0, 4: 0, 5: 0, 6: 0, 11: 0.01, 12: 0.002, 13: 0, 20: 1, 21: 0, 22: 1, 23: 0, 24: 100.0, 25: 900.0, 26: 25, 27: 1.0}
+_COMMON = {
+    0: 10,
+    1: 255,
+    2: 0,
+    3: 0,
+    4: 0,
+    5: 0,
+    6: 0,
+    11: 0.01,
+    12: 0.002,
+    13: 0,
+    20: 1,
+    21: 0,
+    22: 1,
+    23: 0,
+    24: 100.0,
+    25: 3600.0,
+    26: 25,
+    27: 1.0,
+}
 _SPINDLE = {30: 1000.0, 31: 0.0, 32: 0}
 
 
@@ -842,10 +861,14 @@ class _Port:
     url = ""
     opened = False  # since it was last looked at
 
+    connected = False
+
     def plug_in(self) -> None: ...
     def pull(self) -> None: ...
+    def end(self) -> None: ...
     def read(self) -> bytes: ...
     def write(self, data: bytes) -> None: ...
+    def fileno(self) -> int: ...
 
 
 class _Pty(_Port):
@@ -901,7 +924,10 @@ class _Pty(_Port):
 
     @property
     def connected(self) -> bool:
-        return self._open
+        return self._master >= 0 and self._open
+
+    def fileno(self) -> int:
+        return self._master
 
 
 class _Tcp(_Port):
@@ -926,7 +952,8 @@ class _Tcp(_Port):
                 end.close()
         self._listener = self._client = None
 
-    end = pull
+    def end(self) -> None:
+        self.pull()
 
     def read(self) -> bytes:
         if self._listener:
@@ -959,6 +986,9 @@ class _Tcp(_Port):
     def connected(self) -> bool:
         return self._client is not None
 
+    def fileno(self) -> int:
+        return self._client.fileno()
+
 
 class _Server:
     """The machine, its port, and the control port, in one loop."""
@@ -972,17 +1002,16 @@ class _Server:
         self.spoken, self.ended = self.began, False
 
     def run(self) -> None:
-        with selectors.DefaultSelector() as looks:
-            looks.register(self.control, selectors.EVENT_READ)
-            while not self.ended:
-                self._pass()
-                busy = self.port.connected or self.machine.moving or self.machine.task
-                if looks.select(TICK_S if busy else IDLE_S):
-                    self._control()
-                    self.spoken = time.monotonic()
-                if self.port.connected:
-                    self.spoken = time.monotonic()
-                self.ended = self.ended or time.monotonic() - self.spoken > self.linger_s
+        while not self.ended:
+            self._pass()
+            busy = self.port.connected or self.machine.moving or self.machine.task
+            looked_at = [self.control, *([self.port] if self.port.connected else [])]
+            if self.control in select.select(looked_at, [], [], TICK_S if busy else IDLE_S)[0]:
+                self._control()
+                self.spoken = time.monotonic()
+            if self.port.connected:
+                self.spoken = time.monotonic()
+            self.ended = self.ended or time.monotonic() - self.spoken > self.linger_s
         self.port.end()
         self.control.close()
 

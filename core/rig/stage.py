@@ -25,6 +25,7 @@ from .wiring import LETTERS, StageConfig, complaints, units_of, value_of
 ROUNDING = 0.0011  # units: reports have three decimals, and the firmware counts in single precision
 RESENDS = 3  # of lines that were refused because a jog had not ended, or were lost in a start
 GRACE_S = 0.5  # after an expected start, in which another welcome is no news
+LOST_AFTER = 8  # reports of one place, and no answer, after noise: the answer was lost
 QUICK_ASKS = 6  # questions that follow the answer at once, when a place is to be confirmed
 ALL, ALARMS, NOTHING = "all", "alarms", "nothing"  # what a wait heeds: everything, alarms that are called out, nothing
 
@@ -102,7 +103,7 @@ class _Wire:
         import serial
 
         self.url, self._lock = url, threading.Lock()
-        self._failures = (OSError, serial.SerialException, TypeError)  # a TypeError: read while another thread closes it
+        self._failures = (OSError, serial.SerialException, TypeError, AttributeError)  # the last two: closed by another thread meanwhile
         with contextlib.suppress(ImportError):
             import termios
 
@@ -135,8 +136,11 @@ class _Wire:
             raise self._gone(error) from error
 
     def close(self) -> None:
+        inner = getattr(self._port, "_socket", None)
         with contextlib.suppress(*self._failures):
             self._port.close()
+        if inner:
+            inner.close()  # pyserial leaves it open where the other end is gone
 
     def _gone(self, error: Exception) -> StageLost:
         return StageLost(f"{self.url}: the connection is gone ({error}); look at the cable and the controller's power")
@@ -392,7 +396,7 @@ class Stage:
         with self._lock:
             self._stand()
             lines = ["G4P0", *self.config.shutter(True), f"G4P{seconds:.3f}", *self.config.shutter(False)]
-            self._exchange(lines, seconds * self.config.slack + self.config.slack_s, "the shutter line to switch")
+            self._exchange(lines, seconds * self.config.slack + self.config.slack_s, "the shutter line to switch", again=False)
 
     # ---- after something went wrong ----------------------------------------------------------------------------------
 
@@ -574,14 +578,17 @@ class Stage:
             raise StageLost(f"{self.config.url}: not connected; recover first")
         return self._wire
 
-    def _exchange(self, lines: list[str], timeout_s: float, what: str, heed: str = ALL, silence: bool = False) -> None:
-        """Send lines and wait until each is answered. Those that a jog before them has locked out are sent again.
+    def _exchange(self, lines: list[str], timeout_s: float, what: str, heed: str = ALL, silence: bool = False, again: bool = True) -> None:
+        """Send lines and wait until each is answered. Those that a jog before them has locked out are sent again, and, with
+        ``again``, all if an answer was lost.
 
         Raises StageRefused for the first that is refused.
         """
         for _ in range(RESENDS):
             sent = self._stream(lines, timeout_s, what, heed, silence)
-            if any(isinstance(s.answer, Welcome) for s in sent):  # lost in a start that was expected
+            if any(s.answer is None or isinstance(s.answer, Welcome) for s in sent):  # lost to noise, or in a start that was expected
+                if not again:
+                    break
                 continue
             refused = [s for s in sent if isinstance(s.answer, Error)]
             if not refused:
@@ -591,11 +598,11 @@ class Stage:
                 raise StageRefused(
                     f"{self.config.url}: {first.line} was refused: {grbl.error_in_words(first.answer.code, first.answer.text)}", first.answer.code
                 )
-        raise StageLate(f"{self.config.url}: tried {RESENDS} times, waiting for {what}; {self._condition()}")
+        raise StageLate(f"{self.config.url}: no answer came through, waiting for {what}; {self._condition()}")
 
     def _stream(self, lines: list[str], timeout_s: float, what: str, heed: str, silence: bool) -> list[_Sent]:
         """Send lines, never more of them at a time than the controller's buffer holds (character counting)."""
-        waiting, sent = deque(lines), []
+        waiting, sent, garbage = deque(lines), [], self._garbage
         self._sent.clear()
 
         def done() -> bool:
@@ -606,9 +613,11 @@ class Stage:
                 self._connected().write(data)
                 if feed := re.match(r"G53G1.*F(\d+)$", sent[-1].line):
                     self._feed = int(feed[1])
-            return not waiting and not self._sent
+            lost = self._garbage > garbage and self._track.alike >= LOST_AFTER and self._track.state in ("Idle", "Alarm", "Check")
+            return not waiting and (not self._sent or lost)
 
         self._wait(done, what, timeout_s, heed=heed, silence=silence)
+        self._sent.clear()
         return sent
 
     def _idle_again(self) -> bool:
@@ -678,6 +687,9 @@ class Stage:
                 self._alarm = None
                 raise StageStopped(f"{self.config.url}: the controller was reset, waiting for {what}; home")
             return
+        if self._restarted and self._alarm is None:
+            self._restarted = self._known = False
+            raise PositionLost(f"{self.config.url}: the controller has restarted by itself, waiting for {what}; look at its power, and home")
         if self._alarm is not None:
             code, text = self._alarm, ""
         elif heed == ALL and self._track.state == "Alarm":
@@ -688,9 +700,6 @@ class Stage:
             if code not in grbl.POSITION_KEPT:
                 self._known = False
             raise StageAlarm(f"{self.config.url}: waiting for {what}: {grbl.alarm_in_words(code, text)}", code)
-        if self._restarted:
-            self._restarted = self._known = False
-            raise PositionLost(f"{self.config.url}: the controller has restarted by itself, waiting for {what}; look at its power, and home")
         if self._stop and (heed == ALARMS or self._held or self._track.state == "Idle"):
             self._stop = False
             if heed == ALARMS:  # homing heeds nothing but a reset
@@ -721,7 +730,7 @@ class Stage:
                 self._alarm = message.code
             case Welcome():
                 self._welcomes += 1
-                self._restarted = time.monotonic() > self._expected + GRACE_S
+                self._restarted = self._reset_asked or time.monotonic() > self._expected + GRACE_S
                 for sent in self._sent:
                     sent.answer = message
                 self._sent.clear()
