@@ -104,6 +104,7 @@ MODE = ("autoexposuremode", "expprogram", "exposuremode")
 FOCUS = ("focusmode", "autofocus", "focusmode2")
 BATTERY = ("batterylevel",)
 TARGET = ("capturetarget",)
+MOST_EVENTS = 50
 LOW_BATTERY = 25  # percent
 NEAR_STOPS, FAR_STOPS = 0.2, 0.75  # a choice this far from what was asked is said, or refused
 
@@ -155,6 +156,7 @@ class GphotoCamera:
             self._connect()
         raw = self._settings is None or self._settings.raw
         with self._explained("photographing"):
+            self._drain()
             places = [self._camera.capture(self._gp.GP_CAPTURE_IMAGE)]
             if raw and Path(places[0].name).suffix.lower() in (".jpg", ".jpeg"):  # one of two, where a body is set to write both
                 places += self._more_files()
@@ -287,6 +289,12 @@ class GphotoCamera:
     def _offered(self):
         with self._explained("asking for its settings"):
             return self._camera.get_config()
+
+    def _drain(self) -> None:
+        """Take what the camera still has to say of earlier photographs, so that it is not taken for news of the next."""
+        for _ in range(MOST_EVENTS):
+            if self._camera.wait_for_event(1)[0] == self._gp.GP_EVENT_TIMEOUT:
+                return
 
     def _more_files(self) -> list:
         """Further files of the last photograph."""

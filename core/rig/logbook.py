@@ -7,6 +7,7 @@ program or the machine ended while it was written, is cut off; a damaged one in 
 import json
 import os
 import zlib
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -32,6 +33,7 @@ class Logbook:
             sync_folder(self.path.parent)
         except OSError as error:
             raise explain(error, self.path) from error
+        self._torn = False
         self._end, self._number = whole, max([len(self.records), *(record["n"] for record in self.records)])
 
     def __enter__(self):
@@ -43,14 +45,18 @@ class Logbook:
     def write(self, what: str, **fields) -> dict:
         """Add a record with the time, and have it on the disk. Raises StrandscopeError where it cannot be; then nothing was added."""
         record = {"n": self._number + 1, "time": datetime.now(UTC).isoformat(timespec="milliseconds"), "what": what, **fields}
-        left = memoryview(_line(record))
+        left = memoryview(b"\n" * self._torn + _line(record))  # a line that could not be taken back ends first
         try:
             while left:
                 left = left[self._file.write(left) :]
             os.fsync(self._file.fileno())
         except OSError as error:
-            self._file.truncate(self._end)
+            self._torn = True
+            with suppress(OSError):
+                self._file.truncate(self._end)
+                self._torn = False
             raise explain(error, self.path) from error
+        self._torn = False
         self._end, self._number = self._file.tell(), record["n"]
         self.records.append(record)
         return record

@@ -364,3 +364,35 @@ def test_a_logbook_survives_what_happens_to_its_last_line_and_to_one_in_the_midd
     records, bad = read(path.read_bytes())
     assert bad == [middle + 1]
     assert [r["n"] for r in records] == sorted({r["n"] for r in records})
+
+
+def test_a_line_that_could_not_be_written_whole_spoils_no_other(tmp_path, monkeypatch):
+    """The disk is full in the middle of a line, and what was written of it can be taken back, or cannot."""
+    with Logbook(tmp_path / "book") as book:
+        book.write("one", text="ä")
+        real = book._file
+        for stuck in (False, True):
+
+            class Full:
+                def __getattr__(self, name):
+                    return getattr(real, name)
+
+                def write(self, data):
+                    if len(data) < 40:
+                        raise OSError(28, "no space")
+                    return real.write(data[:20])
+
+                def truncate(self, size, stuck=stuck):
+                    if stuck:
+                        raise OSError(28, "no space")
+                    return real.truncate(size)
+
+            monkeypatch.setattr(book, "_file", Full())
+            with pytest.raises(StrandscopeError, match="disk is full"):
+                book.write("lost", text="x" * 30)
+            monkeypatch.setattr(book, "_file", real)
+            book.write("next")
+    with Logbook(tmp_path / "book") as again:
+        assert [record["what"] for record in again.records] == ["one", "next", "next"]
+        assert [record["n"] for record in again.records] == [1, 2, 3]
+        assert again.damaged == [3]
