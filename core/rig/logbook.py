@@ -6,6 +6,7 @@ program or the machine ended while it was written, is cut off; a damaged one in 
 
 import json
 import os
+import threading
 import zlib
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -33,7 +34,7 @@ class Logbook:
             sync_folder(self.path.parent)
         except OSError as error:
             raise explain(error, self.path) from error
-        self._torn = False
+        self._torn, self._lock = False, threading.Lock()
         self._end, self._number = whole, max([len(self.records), *(record["n"] for record in self.records)])
 
     def __enter__(self):
@@ -44,6 +45,10 @@ class Logbook:
 
     def write(self, what: str, **fields) -> dict:
         """Add a record with the time, and have it on the disk. Raises StrandscopeError where it cannot be; then nothing was added."""
+        with self._lock:
+            return self._write(what, fields)
+
+    def _write(self, what: str, fields: dict) -> dict:
         record = {"n": self._number + 1, "time": datetime.now(UTC).isoformat(timespec="milliseconds"), "what": what, **fields}
         left = memoryview(b"\n" * self._torn + _line(record))  # a line that could not be taken back ends first
         try:

@@ -14,9 +14,11 @@ import json
 import math
 import os
 import shutil
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -332,9 +334,12 @@ class _Run:
         self.failing: StrandscopeError | None = None  # the trouble that lasts, since when, and how often it was met
         self.failing_since, self.tries = 0.0, 0
         self.now: Exposure | None = None
+        self.pool, self.keeping = ThreadPoolExecutor(1), None  # makes a photograph safe while the stage goes to the next: exposure, future
+        self._telling = threading.Lock()
         self._events = open(folder / EVENTS, "wb", buffering=0)  # noqa: SIM115
 
     def close(self) -> None:
+        self.pool.shutdown()
         self._events.close()
 
     # -- the whole
@@ -349,29 +354,52 @@ class _Run:
         self._expect_room()
         self.book.write("run", exposures=len(self.exposures), safe=self._done)
         self.say("connecting")
-        while (exposure := next((e for e in self.exposures if key(e) not in self.story.safe), None)) is not None:
+        while True:
             begun = self.clock()
+            exposure = next((e for e in self.exposures if key(e) not in self.story.safe and not self._in_hand(e)), None)
             try:
                 self._obey()
-                if not self.ready:
+                if exposure is None:
+                    self._kept()
+                    if self._done == len(self.exposures):
+                        return self._finish()
+                elif not self.ready:
                     self._get_ready()
-                    continue
-                self._photograph(exposure)
+                else:
+                    self._photograph(exposure)
+                    self.pace.append(self.clock() - begun)
             except (StageError, CameraError, DiskFull) as trouble:
                 self._bear(trouble)
-                continue
-            self.pace.append(self.clock() - begun)
-            self.failing, self.tries = None, 0
-        return self._finish()
+
+    def _in_hand(self, exposure: Exposure) -> bool:
+        return self.keeping is not None and self.keeping[0] is exposure
+
+    def _kept(self) -> None:
+        """Wait until the last photograph is safe. Raises what kept it from being so."""
+        if self.keeping:
+            (_, future), self.keeping = self.keeping, None
+            future.result()
+
+    def _trouble_in_hand(self) -> StrandscopeError | None:
+        """The same, but what is raised is returned."""
+        try:
+            self._kept()
+        except (StageError, CameraError, DiskFull) as trouble:
+            return trouble
+        return None
 
     def _bear(self, trouble: StrandscopeError) -> None:
         """Tell trouble and wait a little, or raise it when patience is at its end."""
+        met = [trouble, self._trouble_in_hand()]
+        trouble = next((t for t in met if isinstance(t, StageError)), trouble)  # the stage has to be recovered in any case
         self.ready, now = False, self.clock()
         self.failing_since = now if self.tries == 0 else self.failing_since
         self.failing, self.tries = trouble, self.tries + 1
         waits = isinstance(trouble, COMES_BACK)
         with suppress(DiskFull):
-            self._note_down("trouble", message=str(trouble), kind=type(trouble).__name__)
+            for each in met:
+                if each:
+                    self._note_down("trouble", message=str(each), kind=type(each).__name__)
         if (waits and now - self.failing_since > self.params.patience_s) or (not waits and self.tries >= self.params.attempts):
             raise trouble
         self.say("waiting", f"{trouble}; trying again")
@@ -401,7 +429,10 @@ class _Run:
         self.ready = True
 
     def _finish(self) -> Path:
-        capture = derive(self.folder, self.story)
+        try:
+            capture = derive(self.folder, self.story)
+        except StrandscopeError as error:
+            raise DiskFull(str(error)) from error
         damaged = [words for _, words in verify(self.folder, self.story, 0)]
         if damaged:
             raise StrandscopeError(f"{damaged[0]}; run the same command again, it is taken anew")
@@ -415,12 +446,12 @@ class _Run:
     def _photograph(self, exposure: Exposure) -> None:
         """Take one photograph and make it safe. Raises StageError, CameraError, DiskFull."""
         self.now = exposure
-        self._resume_watch(exposure)
         self._expect_room_now()
         self.say("moving")
         p = self.plan
         place = self.stage.move_to(*exposure.place, approach_deg=p.approach_deg, approach_mm=p.approach_mm, settle_s=p.settle_s)
         self._expect_there(exposure, place, "arrived")
+        self._kept()  # the one before
         what = dict(zip(("kind", "sweep", "frame"), key(exposure), strict=True))
         self._note_down("exposing", **what, **_place(place))
         self.say("exposing")
@@ -436,13 +467,23 @@ class _Run:
             raise
         try:
             self._expect_there(exposure, self.stage.position(), "stood after the exposure")
+        except BaseException:
+            self._aside(captured.path, "not proven safe")
+            raise
+        self.keeping = exposure, self.pool.submit(self._make_safe, exposure, captured, what)
+
+    def _make_safe(self, exposure: Exposure, captured: CapturedFile, what: dict) -> None:
+        """Look at a photograph, keep it, and tell. Runs beside the motion to the next."""
+        try:
             self._keep(exposure, captured, what)
         except BaseException:
             self._aside(captured.path, "not proven safe")
             raise
+        self.failing, self.tries = None, 0
         self.camera.safe(captured)
-        self.progress("photographs", self._done, len(self.exposures))
-        self.say("safe")
+        with self._telling:
+            self.progress("photographs", self._done, len(self.exposures))
+        self.say("safe", exposure=exposure)
 
     def _expect_there(self, exposure: Exposure, place: Place, how: str) -> None:
         off_deg, off_mm = abs(place.angle_deg - exposure.angle_deg), abs(place.position_mm - exposure.position_mm)
@@ -480,7 +521,8 @@ class _Run:
         self._show(planes)
         if self._sweep_complete(exposure):
             warnings += self.watch.sweep_done(self.plan.count)
-            derive(self.folder, self.story)
+            with suppress(StrandscopeError):  # the disk is full: at the end it is written in any case
+                derive(self.folder, self.story)
         for words in warnings:
             self.warn(words)
 
@@ -502,6 +544,7 @@ class _Run:
         return header, planes
 
     def _seen(self, exposure: Exposure, planes: np.ndarray) -> tuple[Sight, list[str]]:
+        self._resume_watch(exposure)
         if exposure.kind == CHECK:
             return look(planes), self.watch.check(planes)
         return self.watch.photograph(exposure.sweep, exposure.frame, exposure.position_mm, planes)
@@ -579,7 +622,9 @@ class _Run:
     def _obey(self) -> None:
         """Do what was asked, and stay here while paused. Raises RunStopped."""
         while True:
-            for asked in self.orders.take():
+            asked_for = self.orders.take()
+            trouble = self._trouble_in_hand() if asked_for else None
+            for asked in asked_for:
                 what = asked.get("order")
                 if what == ABORT:
                     safe = f"{self._done} of {len(self.exposures)} photographs safe"
@@ -591,6 +636,8 @@ class _Run:
                     self.note("paused; do not touch the hair" if self.paused else "going on")
                 elif what == REPEAT and isinstance(asked.get("sweep"), int):
                     self._repeat(asked["sweep"])
+            if trouble:
+                raise trouble
             if not self.paused:
                 return
             self.sleep(0.05)
@@ -622,11 +669,10 @@ class _Run:
             return median(self.pace) * left
         return self.plan.duration_s(start=len(self.exposures) - left) if left else 0.0
 
-    def say(self, state: str, message: str = "") -> None:
+    def say(self, state: str, message: str = "", exposure: Exposure | None = None) -> None:
         """Tell where the run is."""
         where = {}
-        if self.now:
-            e = self.now
+        if e := exposure or self.now:
             where = {"kind": e.kind, "sweep": e.sweep, "frame": e.frame, "angle_deg": e.angle_deg, "position_mm": e.position_mm}
             if key(e) in self.story.safe:
                 record = self.story.safe[key(e)]
@@ -650,6 +696,7 @@ class _Run:
 
     def end(self, state: str, message: str) -> None:
         try:
+            self._trouble_in_hand()
             self.book.write("end", state=state, message=message)
             self.say(state, message)
         except StrandscopeError:
@@ -657,9 +704,10 @@ class _Run:
 
     def _event(self, **event) -> None:
         event["time"] = round(time.time(), 3)
-        with suppress(OSError):  # the disk is full; that is told where it matters
-            self._events.write(json.dumps(event).encode() + b"\n")
-        self.listener(event)
+        with self._telling:
+            with suppress(OSError):  # the disk is full; that is told where it matters
+                self._events.write(json.dumps(event).encode() + b"\n")
+            self.listener(event)
 
     def _aside(self, path: Path, why: str) -> None:
         """Put a file that is no photograph of the capture where it disturbs nobody."""

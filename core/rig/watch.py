@@ -18,6 +18,7 @@ from .calibrate import BLOCK_PX, BOARD_SHARE, drift, gains, light
 
 WHITE_NEAR = 0.98  # of white: clipped, in spite of noise and of white levels that are a little off
 FINE_PX = (0.8, 1.6)  # sigmas of the band in which what is in focus differs most from what is not
+COMPARED_PX = 350  # rows of a picture that is compared for motion: of larger ones, pixels are averaged
 TILE_PX = 96  # of the pictures that are compared for motion
 LEAST_TEXTURE = 1e-4  # mean square of the gradient along a direction, over the light's, that tells motion along it
 SAME_HUE = 0.01  # of the share of blue: the same board
@@ -57,7 +58,7 @@ def look(planes: np.ndarray) -> Sight:
     brightest = planes.max(axis=0)
     block = min(BLOCK_PX, *planes.shape[1:])
     blocks = light(planes) if block == BLOCK_PX else planes.mean(axis=(1, 2), keepdims=True)
-    return Sight(float((brightest > WHITE_NEAR).mean()), float(np.percentile(brightest, 99)), sharpness(planes[0]), blocks)
+    return Sight(float((brightest > WHITE_NEAR).mean()), float(np.percentile(brightest[::2, ::2], 99)), sharpness(planes[0]), blocks)
 
 
 def sharpness(plane: np.ndarray) -> float:
@@ -67,7 +68,7 @@ def sharpness(plane: np.ndarray) -> float:
     focusing and framing, and to tell whether anything is in focus.
     """
     fine = ndimage.gaussian_filter(plane, FINE_PX[0]) - ndimage.gaussian_filter(plane, FINE_PX[1])
-    return float(np.percentile(np.abs(fine), 98) / max(float(plane.mean()), 1e-4))
+    return float(np.percentile(np.abs(fine[::2, ::2]), 98) / max(float(plane.mean()), 1e-4))
 
 
 def write_picture(path: Path, planes: np.ndarray, widest_px: int = 800) -> None:
@@ -106,6 +107,7 @@ def motion(before: np.ndarray, after: np.ndarray, iterations: int = 5) -> Motion
     """
     smooth = 1.5
     first, second = (ndimage.gaussian_filter(p.astype(np.float64), smooth) for p in (before, after))
+    second = ndimage.spline_filter(second)
     moved, sigmas, places = [], [], []
     inner = (slice(2, -2), slice(2, -2))
     for rows, columns in _tiles(first.shape):
@@ -145,9 +147,9 @@ def _tiles(shape: tuple[int, int]) -> Iterator[tuple[slice, slice]]:
 
 
 def _shifted(picture: np.ndarray, rows: slice, columns: slice, shift: np.ndarray) -> np.ndarray:
-    """A tile of a picture that was moved by ``shift`` (right, down)."""
+    """A tile of a picture, given by its cubic splines, that was moved by ``shift`` (right, down)."""
     y, x = np.mgrid[rows, columns].astype(np.float64)
-    return ndimage.map_coordinates(picture, [y - shift[1], x - shift[0]], order=3, mode="nearest")
+    return ndimage.map_coordinates(picture, [y - shift[1], x - shift[0]], order=3, mode="nearest", prefilter=False)
 
 
 @dataclass
@@ -194,10 +196,11 @@ class Watch:
         """A check photograph came, at the position of the first of the sweep, after its last. Warnings."""
         if self.first is None or self.first.shape != planes[0].shape:
             return []
-        found = motion(self.first, planes[0]).largest()
-        if found is None or found[0] <= self.params.moved_px:
+        by = max(min(planes.shape[1:]) // COMPARED_PX, 1)
+        found = motion(reduced(self.first, by), reduced(planes[0], by)).largest()
+        if found is None or by * found[0] <= self.params.moved_px:
             return []
-        moved, (column, row) = found
+        moved, column, row = by * found[0], by * found[1][0], by * found[1][1]
         rows, columns = planes.shape[1:]
         where = f"{('upper', 'middle', 'lower')[min(int(3 * row / rows), 2)]} {('left', 'middle', 'right')[min(int(3 * column / columns), 2)]}"
         return [
