@@ -38,6 +38,7 @@ OF_CAMERA = ("slow", "cut short", "wrong order")  # that is: late, or another sh
 OF_COMPUTER = ("kill", "disk full")
 FAULTS = OF_CONTROLLER + OF_CAMERA + OF_COMPUTER
 MOST_STARTS = 12  # of the session in a trial, before it counts as failed
+HOME_S = 15.0  # for homing, which takes less than a second at the speed of the trials
 TRIAL_S = 120.0  # a trial takes no longer
 NEAR_MM, NEAR_DEG = 0.0051, 0.021  # where a photograph was taken, and where it should have been
 
@@ -93,7 +94,7 @@ def attempt(folder: Path, seed: int, faults: tuple[str, ...], params: FaultParam
     transport = rng.choice(("pty", "tcp")) if os.name == "posix" else "tcp"
     config = ControllerConfig(firmware, params.speed, resets_on_open=rng.random() < 0.3, seed=seed)
     with start_controller(config, transport) as controller:
-        rig = _Trial(folder, controller, stage_config(controller.url, config), cable, params, rng)
+        rig = _Trial(folder, controller, stage_config(controller.url, config, home_s=HOME_S), cable, params, rng)
         wrong = rig.run(faults)
         shots = rig.shots()
         moved = sum(controller.moved(begin, end) for begin, end in shots)
