@@ -170,7 +170,7 @@ class _Trial:
     def __init__(self, folder, controller: Controller, config: StageConfig, cable: bool, params: FaultParams, rng: random.Random):
         self.folder, self.controller, self.config, self.params, self.rng = folder, controller, config, params, rng
         self.starts, self.child, self.paused = 0, None, False
-        self.tether = _Tether(folder, controller, config, params) if cable else None
+        self.tether = Tether(folder, controller, config, params) if cable else None
         told = {
             "folder": str(folder), "controller": asdict(controller), "stage": asdict(config), "cable": cable,
             "plan": asdict(params.plan), "speed": params.speed,
@@ -271,10 +271,11 @@ class _Trial:
                 (self.folder / "camera").write_text(fault)
 
 
-class _Tether(threading.Thread):
+class Tether(threading.Thread):
     """A camera on the controller's output, and the software that brings its photographs to a folder."""
 
     def __init__(self, folder: Path, controller: Controller, config: StageConfig, params: FaultParams):
+        """``folder`` gets the folder ``watched``, and may hold a file ``camera`` with the fault of the next photograph."""
         super().__init__(name="tether", daemon=True)
         self.folder, self.controller, self.ended = folder, controller, threading.Event()
         self.watched = folder / "watched"

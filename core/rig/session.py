@@ -481,7 +481,7 @@ class _Run:
             raise
         self.failing, self.tries = None, 0
         self.camera.safe(captured)
-        with self._telling:
+        with self._telling, suppress(OSError):
             self.progress("photographs", self._done, len(self.exposures))
         self.say("safe", exposure=exposure)
 
@@ -707,7 +707,8 @@ class _Run:
         with self._telling:
             with suppress(OSError):  # the disk is full; that is told where it matters
                 self._events.write(json.dumps(event).encode() + b"\n")
-            self.listener(event)
+            with suppress(OSError):  # who listened is gone; the hair still hangs there
+                self.listener(event)
 
     def _aside(self, path: Path, why: str) -> None:
         """Put a file that is no photograph of the capture where it disturbs nobody."""

@@ -139,6 +139,14 @@ def test_a_plan_is_taken_and_reads_as_a_capture(tmp_path, rig):
     assert not session.status(tmp_path)["running"]
 
 
+def test_a_listener_that_is_gone_does_not_end_a_capture(tmp_path, rig):
+    def gone(*_told):
+        raise BrokenPipeError
+
+    run(PLAN, *rig, tmp_path, params=QUICK, events=gone, progress=gone)
+    expect_whole(tmp_path, PLAN)
+
+
 def test_a_turntable_sequence_joins_the_sweeps(tmp_path, rig):
     table = replace(turntable_plan(3, shutter_s=0.001, bytes_each=8000), settle_s=0.0)
     run(PLAN, *rig, tmp_path, params=QUICK)

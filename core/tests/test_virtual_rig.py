@@ -18,13 +18,24 @@ from strandscope.core.cli import run as strandscope
 from strandscope.core.errors import StrandscopeError
 from strandscope.core.raw import read_header, read_planes
 from strandscope.core.rig import operate, session
-from strandscope.core.rig.camera import CameraSettings, cable_camera
-from strandscope.core.rig.operate import Rig, load_rig, save_rig
-from strandscope.core.rig.plan import Place, Plan
-from strandscope.core.rig.session import Setup
+from strandscope.core.rig.camera import CableConfig, CameraSettings, cable_camera, settings_of
+from strandscope.core.rig.controller import ControllerConfig, stage_config, start_controller
+from strandscope.core.rig.operate import CameraConfig, Rig, load_rig, save_rig
+from strandscope.core.rig.plan import Place, Plan, turntable_plan
+from strandscope.core.rig.session import SessionParams, Setup
 from strandscope.core.rig.wiring import StageConfig
+from strandscope.core.rig_faults import FaultParams, Tether
 from strandscope.core.simulate import Scale, SimulateParams, simulate
-from strandscope.core.virtual_rig import VirtualCamera, VirtualParams, hair_in, photographer, virtual_capture, virtual_plan, virtual_studio
+from strandscope.core.virtual_rig import (
+    VirtualCamera,
+    VirtualParams,
+    hair_in,
+    photographer,
+    read_stamp,
+    virtual_capture,
+    virtual_plan,
+    virtual_studio,
+)
 
 HAIR = SimulateParams(scale=Scale(60, 50, 3, 0.4, 6, 0.6, 2), seed=3)
 FAST = VirtualParams(HAIR, speed=60.0)
@@ -125,6 +136,35 @@ def test_what_is_wrong_in_a_rigs_file_is_named(tmp_path, text, said):
     with pytest.raises(StrandscopeError) as error:
         load_rig(tmp_path / "rig.toml")
     assert said in str(error.value)
+
+
+def test_a_rig_with_a_camera_on_a_cable_takes_its_plan_and_its_turntable_sequence(tmp_path):
+    """As a person does it: a file, a port, a folder that the photographs appear in; then the same folder with another plan."""
+    plan = Plan(angles_deg=(0.0, 45.0), first_mm=-0.2, step_mm=0.2, count=3, settle_s=0.05, shutter_s=0.2, bytes_each=8000)
+    table = turntable_plan(4, settle_s=0.05, shutter_s=0.2, bytes_each=8000)
+    config, quick = ControllerConfig(time_factor=40.0), CableConfig(pulse_s=0.2, wait_s=2.0, quiet_s=0.02, poll_s=0.005)
+    with start_controller(config, "tcp") as controller:
+        rig = Rig(plan, stage_config(controller.url, config), CameraConfig("cable", str(tmp_path / "watched"), cable=quick), Setup("switch"))
+        tether = Tether(tmp_path, controller, rig.stage, FaultParams(plan=plan, speed=40.0))
+        tether.start()
+        told = []
+        for each in (plan, table):
+            tether.camera.settings = settings_of(each)
+            done = operate.capture(replace(rig, plan=each), tmp_path / "switch", SessionParams(reserve_bytes=0), events=told.append)
+        tether.stop()
+        assert not any(controller.moved(*shot) for shot in tether.shots)
+    capture = load_capture(done)
+    assert capture.name == "switch"
+    assert [len(s.files) for s in capture.sweeps] == [3, 3]
+    for files, places in (
+        *((s.files, [Place(s.angle_deg, d) for d in s.positions_mm]) for s in capture.sweeps),
+        (capture.turntable.files, [Place(a, 0.0) for a in table.angles_deg]),
+    ):
+        for file, place in zip(files, places, strict=True):
+            assert read_stamp(tmp_path / "switch" / file).place == pytest.approx(place, abs=0.0011)
+    assert any("set on the camera itself" in e.get("message", "") for e in told)
+    assert len(tether.shots) == len(plan) + len(table) + 2  # and a test shot a run
+    assert load_rig(tmp_path / "switch" / operate.FILE) == replace(rig, plan=table)
 
 
 def test_the_plan_of_a_virtual_rig_is_that_of_the_simulation():
