@@ -219,7 +219,9 @@ class Machine:
         self._raise_alarm(code)
 
     def reset(self) -> None:
-        """0x18, or the reset button."""
+        """0x18, or the reset button. Not heard while a critical alarm is being called out."""
+        if self.critical and self.now < self.busy_until:
+            return
         if self.state in ("Run", "Jog", "Home") or self.block_halting:
             self._stop_dead()
             self._say(f"ALARM:{6 if self.homing else 3}")
@@ -262,7 +264,7 @@ class Machine:
     def _clear(self) -> None:
         self.rx, self.task, self.waits = bytearray(), None, None
         self.blocks: deque[_Block] = deque()
-        self.block_halting = self.held = self.stopping = self.homing = self.critical = self.asked = False
+        self.block_halting = self.held = self.stopping = self.homing = self.critical = self.tells_to_reset = self.asked = False
         self.busy_until = self.now
         self.modal = {"motion": "G0", "distance": "G90", "units": "G21", "feed": 0.0}
         self.g92 = dict.fromkeys(self.axes, 0.0)
@@ -393,6 +395,9 @@ class Machine:
                 self._welcome()
             else:
                 return
+        if self.tells_to_reset and self.now >= self.busy_until:
+            self.tells_to_reset = False
+            self._say("[MSG:Reset to continue]")
         while self._ready():
             if self.asked:
                 self.asked = False
@@ -687,8 +692,7 @@ class Machine:
         self._say(f"ALARM:{code}")
         self.busy_until = self.now + ALARM_DELAY_S[self.config.firmware]
         if code in grbl.CRITICAL:
-            self.critical = True
-            self._say("[MSG:Reset to continue]")
+            self.critical = self.tells_to_reset = True
 
     def _switch(self, name: str, on: bool) -> None:
         if self.exposing.get(name, False) != on:
@@ -907,14 +911,10 @@ class _Pty(_Port):
             return b""
         try:
             data = os.read(self._master, 4096)
-        except BlockingIOError:
-            data = b""
+            is_open = data != b""
         except OSError as error:
-            if error.errno != errno.EIO:
-                raise
-            self._open = False  # nobody has it open
-            return b""
-        self.opened, self._open = self.opened or not self._open, True
+            data, is_open = b"", error.errno != errno.EIO  # or there is nothing to read just now
+        self.opened, self._open = self.opened or (is_open and not self._open), is_open
         return data
 
     def write(self, data: bytes) -> None:

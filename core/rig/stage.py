@@ -23,6 +23,7 @@ from .plan import Lash, Place, Plan, approach
 from .wiring import LETTERS, StageConfig, complaints, units_of, value_of
 
 ROUNDING = 0.0011  # units: reports have three decimals, and the firmware counts in single precision
+RESETS = 4  # until one is heard
 RESENDS = 3  # of lines that were refused because a jog had not ended, or were lost in a start
 GRACE_S = 0.5  # after an expected start, in which another welcome is no news
 LOST_AFTER = 8  # reports of one place, and no answer, after noise: the answer was lost
@@ -442,8 +443,11 @@ class Stage:
     def _again(self) -> bool:
         """A controller that answers; returns whether the position is still known. Raises StageLost."""
         if self._wire is not None:
-            self._settle_down()
-            self._quiet_reset()
+            if self._alarm in grbl.CRITICAL:
+                self._leave_critical()
+            else:
+                self._settle_down()
+                self._quiet_reset()
             return self._known
         known, feed = self._known, self._feed
         self._connect()
@@ -515,11 +519,17 @@ class Stage:
         before, welcomes = self._track.state, self._welcomes
         alarm, self._alarm = self._alarm, None
         self._sent.clear()
-        self._expected = time.monotonic() + self.config.welcome_s + 2
-        self._now(grbl.RESET)
+        self._expected = time.monotonic() + RESETS * (self.config.welcome_s + 1.0)
         started = lambda: self._welcomes > welcomes  # noqa: E731
-        self._wait(started, "the controller to start again", self.config.welcome_s + 2, heed=NOTHING, silence=True, ask=False)
-        self._expected = time.monotonic()
+        for sent in range(1, RESETS + 1):  # GRBL does not hear one in the half second in which it calls out a critical alarm
+            self._now(grbl.RESET)
+            try:
+                self._wait(started, "the controller to start again", self.config.welcome_s, heed=NOTHING, silence=True, ask=False)
+                break
+            except StageLate:
+                if sent == RESETS:
+                    raise
+        self._expected = time.monotonic() + (1.0 if sent > 1 else 0.0)  # each that was heard has its welcome
         self._reset_asked = self._stop = self._restarted = False
         self._fresh()
         self._wait(lambda: self._track.state, "a status report", self.config.silent_s + 1, heed=NOTHING, quick=True)
@@ -531,6 +541,9 @@ class Stage:
 
     def _leave_critical(self) -> None:
         if self._alarm in grbl.CRITICAL:
+            with contextlib.suppress(StageLate):  # it says when it will hear
+                ready = lambda: any("Reset" in message.text for message in self._feedback)  # noqa: E731
+                self._wait(ready, "the controller", 1.0, heed=NOTHING, silence=True, ask=False)
             self._reset()
 
     def _settle_down(self) -> None:
@@ -648,13 +661,14 @@ class Stage:
     def _wait(
         self, done: Callable, what: str, timeout_s: float, *, heed: str = ALL, silence: bool = False, ask: bool = True, quick: bool = False
     ) -> None:
-        """Listen, asking for the status now and then, until ``done``. While the stage is held, time does not count.
+        """Listen, asking for the status now and then, until ``done``. While the stage is held, time does not count, and while it is
+        seen to move, ``slack_s`` are always left.
 
         ``silence``: the controller need not answer questions meanwhile. ``quick``: ask again as soon as it has answered, a few
         times. Raises StageLate, StageLost, and what ``_heed`` does.
         """
         start = last = time.monotonic()
-        end, asks, answered, told = start + timeout_s, 0, -1, False
+        end, asks, answered, told, place = start + timeout_s, 0, -1, False, self._track.machine
         while True:
             now = time.monotonic()
             if heed == ALL and self._track.state in grbl.PAUSED:
@@ -663,6 +677,8 @@ class Stage:
                     told = True
                     self.tell("the safety door is open" if self._track.state == "Door" else "the stage is held; resume to go on")
             last = now
+            if self._track.machine != place and self._track.state in grbl.MOVING:
+                place, end = self._track.machine, max(end, now + min(timeout_s, self.config.slack_s))
             self._heed(heed, what)
             if done():
                 return
@@ -728,6 +744,7 @@ class Stage:
                     self._sent.popleft().answer = message
             case Alarm():
                 self._alarm = message.code
+                self._feedback.clear()
             case Welcome():
                 self._welcomes += 1
                 self._restarted = self._reset_asked or time.monotonic() > self._expected + GRACE_S
