@@ -35,7 +35,7 @@ from .virtual_rig import SimulatedWorld, VirtualCamera, VirtualCameraConfig, rea
 WORKER = Path(__file__).resolve().parent.parent / "worker.py"
 OF_CONTROLLER = ("cable", "alarm", "garbage", "noise", "silence", "power", "reset button", "hold button")
 OF_CAMERA = ("slow", "cut short", "wrong order")  # that is: late, or another shot's bytes
-OF_COMPUTER = ("kill", "disk full")
+OF_COMPUTER = ("kill", "disk full") if os.name == "posix" else ("kill",)
 FAULTS = OF_CONTROLLER + OF_CAMERA + OF_COMPUTER
 MOST_STARTS = 12  # of the session in a trial, before it counts as failed
 HOME_S = 15.0  # for homing, which takes less than a second at the speed of the trials

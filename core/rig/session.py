@@ -332,7 +332,7 @@ class _Run:
         self.paused, self.shown = False, -math.inf
         self.ready = self.prepared = False
         self.failing: StrandscopeError | None = None  # the trouble that lasts, since when, and how often it was met
-        self.failing_since, self.tries = 0.0, 0
+        self.failing_since, self.tries, self.said = 0.0, 0, ""
         self.now: Exposure | None = None
         self.pool, self.keeping = ThreadPoolExecutor(1), None  # makes a photograph safe while the stage goes to the next: exposure, future
         self._telling = threading.Lock()
@@ -396,13 +396,16 @@ class _Run:
         self.failing_since = now if self.tries == 0 else self.failing_since
         self.failing, self.tries = trouble, self.tries + 1
         waits = isinstance(trouble, COMES_BACK)
+        again = self.tries > 1 and str(trouble) == self.said  # every few seconds, perhaps for half an hour
         with suppress(DiskFull):
-            for each in met:
+            for each in () if again else met:
                 if each:
                     self._note_down("trouble", message=str(each), kind=type(each).__name__)
         if (waits and now - self.failing_since > self.params.patience_s) or (not waits and self.tries >= self.params.attempts):
             raise trouble
-        self.say("waiting", f"{trouble}; trying again")
+        if not again:
+            self.say("waiting", f"{trouble}; trying again")
+        self.said = str(trouble)
         until = self.clock() + (self.params.retry_s if self.tries > 1 else 0.0)
         while self.clock() < until:
             self._obey()

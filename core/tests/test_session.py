@@ -272,9 +272,11 @@ def test_patience_ends(tmp_path, rig):
     stage, camera = rig
     now = iter(np.arange(0, 1e6, 0.5))
     camera.faults = {n: CameraGone("unplugged") for n in range(2, 10_000)}
+    told = []
     with pytest.raises(CameraGone):
-        run(PLAN, stage, camera, tmp_path, params=replace(QUICK, patience_s=60.0), clock=lambda: float(next(now)))
+        run(PLAN, stage, camera, tmp_path, params=replace(QUICK, patience_s=60.0), clock=lambda: float(next(now)), events=told.append)
     assert 10 < len(camera.shots) < 100
+    assert sum("unplugged; trying" in event.get("message", "") for event in told) == 1  # said once
     assert session.status(tmp_path)["state"] == "failed"
 
 
