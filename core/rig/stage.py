@@ -26,6 +26,7 @@ ROUNDING = 0.0011  # units: reports have three decimals, and the firmware counts
 RESETS = 4  # until one is heard
 RESENDS = 3  # of lines that were refused because a jog had not ended, or were lost in a start
 GRACE_S = 0.5  # after an expected start, in which another welcome is no news
+CANCEL_S = 0.5  # between two requests to end a jog
 LOST_AFTER = 8  # reports of one place, and no answer, after noise: the answer was lost
 QUICK_ASKS = 6  # questions that follow the answer at once, when a place is to be confirmed
 ALL, ALARMS, NOTHING = "all", "alarms", "nothing"  # what a wait heeds: everything, alarms that are called out, nothing
@@ -343,7 +344,7 @@ class Stage:
         """Feed hold: slow down and halt, keeping the position; of a jog, its end. Returns when it stands, or at once if another
         thread is waiting for the motion."""
         self._now(grbl.HOLD)
-        self._if_free(lambda: self._held or self._track.state in ("Idle", "Alarm", "Check", "Sleep"), "the stage to halt")
+        self._if_free(self._halted, "the stage to halt")
 
     def resume(self) -> None:
         """Go on after a hold."""
@@ -482,6 +483,7 @@ class Stage:
         self._restarted = False
         self._welcomes = self._reports = 0
         self._heard = self._asked = self._expected = time.monotonic()
+        self._cancelled = -CANCEL_S
 
     def _connect(self) -> None:
         """Open the port and wait for a sign of life: the welcome of a controller that restarts when its port is opened, or the
@@ -510,9 +512,8 @@ class Stage:
             self._wait(lambda: self._track.state, "a status report", self.config.silent_s + 1, heed=NOTHING, quick=True)
             if self._track.state in ("Run", "Jog", *grbl.PAUSED):
                 self._now(grbl.HOLD)
-                halted = lambda: self._held or self._track.state in ("Idle", "Alarm")  # noqa: E731
                 with contextlib.suppress(StageLate):
-                    self._wait(halted, "the stage to halt", self.config.slack_s, heed=NOTHING)
+                    self._wait(self._halted, "the stage to halt", self.config.slack_s, heed=NOTHING)
         self._reset()
 
     def _reset(self) -> None:
@@ -716,7 +717,7 @@ class Stage:
             if code not in grbl.POSITION_KEPT:
                 self._known = False
             raise StageAlarm(f"{self.config.url}: waiting for {what}: {grbl.alarm_in_words(code, text)}", code)
-        if self._stop and (heed == ALARMS or self._held or self._track.state == "Idle"):
+        if self._stop and (heed == ALARMS or self._halted()):
             self._stop = False
             if heed == ALARMS:  # homing heeds nothing but a reset
                 self._reset()
@@ -788,6 +789,13 @@ class Stage:
         track = self._track
         ended = track.substate == 0 or (track.state == "Door" and track.substate == 1) or (track.substate is None and track.alike >= 2)
         return track.state in grbl.PAUSED and ended
+
+    def _halted(self) -> bool:
+        """Whether a hold, or what came of it, is over. grblHAL does not hold a jog, but ends it when told to."""
+        if self._track.state == "Jog" and time.monotonic() - self._cancelled > CANCEL_S:
+            self._cancelled = time.monotonic()
+            self._now(grbl.CANCEL_JOG)
+        return self._held or self._track.state in ("Idle", "Alarm", "Check", "Sleep")
 
     def _must_know(self) -> None:
         if not self._known:

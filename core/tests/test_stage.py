@@ -118,7 +118,7 @@ def test_without_homing_the_controllers_zero_is_the_mark():
 
 @pytest.mark.parametrize("firmware", [GRBL, GRBLHAL])
 def test_a_jog_is_cancelled_where_it_is_and_a_move_may_follow_at_once(firmware):
-    with rig(firmware, factor=10) as (stage, controller):
+    with rig(firmware, factor=20) as (stage, controller):
         stage.move_to(20, -10)
         stage.jog(position_mm=40)
         until(lambda: stage.status().place.position_mm > -9, "the jog begins")
@@ -155,8 +155,9 @@ def test_a_hold_is_no_delay_that_counts(firmware):
         assert any("held" in line for line in said)
 
 
-def test_hold_and_resume_alone():
-    with rig(factor=10) as (stage, controller):
+@pytest.mark.parametrize("firmware", [GRBL, GRBLHAL])
+def test_hold_and_resume_alone(firmware):
+    with rig(firmware, factor=30) as (stage, controller):
         stage.move_to(0, -10)
         stage.jog(position_mm=30)
         stage.hold()  # ends a jog
