@@ -2,6 +2,8 @@
 
 import contextlib
 import random
+import subprocess
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -263,6 +265,29 @@ def test_a_pulled_cable_is_noticed_and_survived(firmware, transport):
         assert true(stage, controller, Place(10, 0))
 
 
+@pytest.mark.parametrize("firmware", [GRBL, GRBLHAL])
+def test_a_cable_that_is_pulled_where_it_stands_costs_nothing(firmware):
+    with rig(firmware) as (stage, controller):
+
+        def pull():
+            controller.pull_cable()
+            with pytest.raises(StageLost):
+                stage.position()
+            controller.plug_in()
+            assert stage.recover(20) is True
+            assert true(stage, controller)
+
+        pull()  # homed, and nothing else
+        stage.move_to(0, 5)
+        pull()
+        with pytest.raises(StageAlarm):
+            stage.move_to(0, 90)
+        stage.recover()
+        pull()
+        stage.stop()
+        pull()
+
+
 @pytest.mark.parametrize(("firmware", "transport"), RIGS)
 def test_a_controller_that_restarted_unseen_is_homed(firmware, transport):
     with rig(firmware, transport) as (stage, controller):
@@ -377,6 +402,11 @@ def test_garbage_between_answers_is_ignored():
             stage.move_to(k, k)
             assert true(stage, controller, Place(k, k))
         assert stage.garbage > 0
+
+
+def test_without_a_port_to_open_pyserial_is_not_asked_for():
+    code = "import strandscope.core.rig.stage, strandscope.core.rig.controller, sys; assert 'serial' not in sys.modules"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 # ---- the port --------------------------------------------------------------------------------------------------------
