@@ -185,8 +185,10 @@ class Machine:
             elif char == grbl.RESUME:
                 self._resume()
             elif char == grbl.CANCEL_JOG:
+                if self.hal:
+                    self.rx.clear()  # lines that it has not begun are dropped, in whatever state
                 if self.state == "Jog":
-                    self._hold()
+                    self._hold(cancel=True)
             elif byte >= 0x80:
                 continue
             elif len(self.rx) < RX_BYTES[self.config.firmware]:
@@ -352,7 +354,9 @@ class Machine:
         self._ends(self.now)
         self.blocks.clear()
 
-    def _hold(self) -> None:
+    def _hold(self, cancel: bool = False) -> None:
+        if self.hal and self.state == "Jog" and not cancel:
+            return  # grblHAL ends jogs by their own command only
         if self.state == "Idle":
             self.state, self.held = "Hold", True
         elif self.state in ("Run", "Jog") and self.blocks and self.moving and not self.block_halting:

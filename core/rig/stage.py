@@ -26,6 +26,7 @@ ROUNDING = 0.0011  # units: reports have three decimals, and the firmware counts
 RESETS = 4  # until one is heard
 RESENDS = 3  # of lines that were refused because a jog had not ended, or were lost in a start
 GRACE_S = 0.5  # after an expected start, in which another welcome is no news
+CANCEL_S = 0.5  # between two requests to end a jog
 LOST_AFTER = 8  # reports of one place, and no answer, after noise: the answer was lost
 QUICK_ASKS = 6  # questions that follow the answer at once, when a place is to be confirmed
 ALL, ALARMS, NOTHING = "all", "alarms", "nothing"  # what a wait heeds: everything, alarms that are called out, nothing
@@ -162,7 +163,7 @@ class Stage:
         self._shift = {"turntable": 0.0, "focus": 0.0}  # units, of an axis that no switch can find again
         self._rest: Place | None = None  # where it last stood for certain
         self._turning = False  # the turntable was sent off and has not been seen to arrive
-        self._feed: int | None = None  # the last that the controller was given
+        self._feeds: set[int] = set()  # that the controller was given: after a restart it knows none
         self._lash = Lash()
         self._stop = self._reset_asked = False
         self._garbage = 0
@@ -265,6 +266,7 @@ class Stage:
             if self.config.homing and not self.config.turntable_homes:
                 self._find_turntable()
             self._arrived()
+            self._mark()
             return self._rest
 
     def assume(self, place: Place) -> None:
@@ -279,6 +281,7 @@ class Stage:
             self._shift = {name: self._machine(axis) - units for (name, axis), units in zip(self._axes.items(), stands, strict=True)}
             self._lash = Lash()
             self._arrived()
+            self._mark()
 
     def move_to(self, angle_deg: float, position_mm: float, *, approach_deg: float = 0.0, approach_mm: float = 0.0, settle_s: float = 0.0) -> Place:
         """Go there, each axis arriving from below having gone up at least its approach, and wait until it has stood ``settle_s``.
@@ -343,7 +346,7 @@ class Stage:
         """Feed hold: slow down and halt, keeping the position; of a jog, its end. Returns when it stands, or at once if another
         thread is waiting for the motion."""
         self._now(grbl.HOLD)
-        self._if_free(lambda: self._held or self._track.state in ("Idle", "Alarm", "Check", "Sleep"), "the stage to halt")
+        self._if_free(self._halted, "the stage to halt")
 
     def resume(self) -> None:
         """Go on after a hold."""
@@ -383,6 +386,7 @@ class Stage:
             self._exchange(["$X"], self.config.slack_s, "the alarm to be taken back", heed=NOTHING)
             self._fresh()
             self._wait(lambda: self._track.state not in ("", "Alarm"), "the alarm to end", self.config.slack_s, heed=NOTHING, quick=True)
+            self._mark()
 
     # ---- the shutter line --------------------------------------------------------------------------------------------
 
@@ -405,7 +409,7 @@ class Stage:
         """Connect again as often as it takes, take back an alarm, and home if the position is lost. Returns whether it was kept.
 
         It is kept where the controller proves not to have restarted: it has not said its welcome, is in no alarm that loses it,
-        and still knows the feed rate that it was last given, which a restart forgets. Raises StageLost after ``timeout_s``,
+        and still knows a feed rate that it was given, which a restart forgets. Raises StageLost after ``timeout_s``,
         PositionLost (with ``home=False``, or where nothing can find it again), StageAlarm and StageRefused of homing.
         """
         with self._lock:
@@ -449,7 +453,7 @@ class Stage:
                 self._settle_down()
                 self._quiet_reset()
             return self._known
-        known, feed = self._known, self._feed
+        known = self._known
         self._connect()
         if self._welcomes or not known or (self._alarm is not None and self._alarm not in grbl.POSITION_KEPT):
             return False
@@ -459,7 +463,7 @@ class Stage:
             self._quiet_reset()
             return self._known
         self._wait(lambda: self._track.state not in ("Run", "Jog", "Home"), "the motion to end", self.config.home_s, heed=NOTHING)
-        return self._track.state in ("Idle", "Alarm") and feed is not None and self._modal_feed() == feed and not self._welcomes
+        return self._track.state in ("Idle", "Alarm") and self._modal_feed() in self._feeds and not self._welcomes
 
     def _modal_feed(self) -> float | None:
         """The feed rate that the parser remembers (``$G``). Asked twice: the first may end half a line of the last connection."""
@@ -482,6 +486,7 @@ class Stage:
         self._restarted = False
         self._welcomes = self._reports = 0
         self._heard = self._asked = self._expected = time.monotonic()
+        self._cancelled = -CANCEL_S
 
     def _connect(self) -> None:
         """Open the port and wait for a sign of life: the welcome of a controller that restarts when its port is opened, or the
@@ -510,9 +515,8 @@ class Stage:
             self._wait(lambda: self._track.state, "a status report", self.config.silent_s + 1, heed=NOTHING, quick=True)
             if self._track.state in ("Run", "Jog", *grbl.PAUSED):
                 self._now(grbl.HOLD)
-                halted = lambda: self._held or self._track.state in ("Idle", "Alarm")  # noqa: E731
                 with contextlib.suppress(StageLate):
-                    self._wait(halted, "the stage to halt", self.config.slack_s, heed=NOTHING)
+                    self._wait(self._halted, "the stage to halt", self.config.slack_s, heed=NOTHING)
         self._reset()
 
     def _reset(self) -> None:
@@ -538,6 +542,12 @@ class Stage:
             self._known = False
         self._lash = Lash()
         self._alarm = None
+        self._mark()
+
+    def _mark(self) -> None:
+        """Give the controller a feed rate: as long as it knows one, it has not restarted."""
+        if self._known and self._track.state == "Idle":
+            self._exchange([f"F{max(round(self.config.focus_feed), 1)}"], self.config.slack_s, "the controller to answer", heed=NOTHING)
 
     def _leave_critical(self) -> None:
         if self._alarm in grbl.CRITICAL:
@@ -624,8 +634,8 @@ class Stage:
                 sent.append(_Sent(waiting.popleft(), len(data)))
                 self._sent.append(sent[-1])
                 self._connected().write(data)
-                if feed := re.match(r"G53G1.*F(\d+)$", sent[-1].line):
-                    self._feed = int(feed[1])
+                if feed := re.fullmatch(r"(?:G53G1.*)?F(\d+)", sent[-1].line):
+                    self._feeds.add(int(feed[1]))
             lost = self._garbage > garbage and self._track.alike >= LOST_AFTER and self._track.state in ("Idle", "Alarm", "Check")
             return not waiting and (not self._sent or lost)
 
@@ -716,7 +726,7 @@ class Stage:
             if code not in grbl.POSITION_KEPT:
                 self._known = False
             raise StageAlarm(f"{self.config.url}: waiting for {what}: {grbl.alarm_in_words(code, text)}", code)
-        if self._stop and (heed == ALARMS or self._held or self._track.state == "Idle"):
+        if self._stop and (heed == ALARMS or self._halted()):
             self._stop = False
             if heed == ALARMS:  # homing heeds nothing but a reset
                 self._reset()
@@ -788,6 +798,13 @@ class Stage:
         track = self._track
         ended = track.substate == 0 or (track.state == "Door" and track.substate == 1) or (track.substate is None and track.alike >= 2)
         return track.state in grbl.PAUSED and ended
+
+    def _halted(self) -> bool:
+        """Whether a hold, or what came of it, is over. grblHAL does not hold a jog, but ends it when told to."""
+        if self._track.state == "Jog" and time.monotonic() - self._cancelled > CANCEL_S:
+            self._cancelled = time.monotonic()
+            self._now(grbl.CANCEL_JOG)
+        return self._held or self._track.state in ("Idle", "Alarm", "Check", "Sleep")
 
     def _must_know(self) -> None:
         if not self._known:

@@ -2,6 +2,8 @@
 
 import contextlib
 import random
+import subprocess
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -118,7 +120,7 @@ def test_without_homing_the_controllers_zero_is_the_mark():
 
 @pytest.mark.parametrize("firmware", [GRBL, GRBLHAL])
 def test_a_jog_is_cancelled_where_it_is_and_a_move_may_follow_at_once(firmware):
-    with rig(firmware, factor=10) as (stage, controller):
+    with rig(firmware, factor=20) as (stage, controller):
         stage.move_to(20, -10)
         stage.jog(position_mm=40)
         until(lambda: stage.status().place.position_mm > -9, "the jog begins")
@@ -155,8 +157,9 @@ def test_a_hold_is_no_delay_that_counts(firmware):
         assert any("held" in line for line in said)
 
 
-def test_hold_and_resume_alone():
-    with rig(factor=10) as (stage, controller):
+@pytest.mark.parametrize("firmware", [GRBL, GRBLHAL])
+def test_hold_and_resume_alone(firmware):
+    with rig(firmware, factor=30) as (stage, controller):
         stage.move_to(0, -10)
         stage.jog(position_mm=30)
         stage.hold()  # ends a jog
@@ -260,6 +263,29 @@ def test_a_pulled_cable_is_noticed_and_survived(firmware, transport):
         assert true(stage, controller, Place(10, 30))
         stage.move_to(10, 0)
         assert true(stage, controller, Place(10, 0))
+
+
+@pytest.mark.parametrize("firmware", [GRBL, GRBLHAL])
+def test_a_cable_that_is_pulled_where_it_stands_costs_nothing(firmware):
+    with rig(firmware) as (stage, controller):
+
+        def pull():
+            controller.pull_cable()
+            with pytest.raises(StageLost):
+                stage.position()
+            controller.plug_in()
+            assert stage.recover(20) is True
+            assert true(stage, controller)
+
+        pull()  # homed, and nothing else
+        stage.move_to(0, 5)
+        pull()
+        with pytest.raises(StageAlarm):
+            stage.move_to(0, 90)
+        stage.recover()
+        pull()
+        stage.stop()
+        pull()
 
 
 @pytest.mark.parametrize(("firmware", "transport"), RIGS)
@@ -376,6 +402,11 @@ def test_garbage_between_answers_is_ignored():
             stage.move_to(k, k)
             assert true(stage, controller, Place(k, k))
         assert stage.garbage > 0
+
+
+def test_without_a_port_to_open_pyserial_is_not_asked_for():
+    code = "import strandscope.core.rig.stage, strandscope.core.rig.controller, sys; assert 'serial' not in sys.modules"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 # ---- the port --------------------------------------------------------------------------------------------------------
