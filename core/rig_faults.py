@@ -188,8 +188,10 @@ class _Trial:
             while True:
                 if self.child is None or self.child.poll() is not None:
                     if self.child is not None and self.child.returncode == 0:
-                        late = [fault for _, fault in left] + [_camera_fault(self.folder)]
-                        return [f"{fault} came too late" for fault in late if fault]
+                        if not left and not (self.folder / "camera").exists():
+                            return []
+                        (self.folder / "repeat").write_text(str(self.rng.randrange(len(self.params.plan.angles_deg))))  # faults are left
+                        left = [(self._safe() + 1 + i, fault) for i, (_, fault) in enumerate(left)]
                     if self.starts == MOST_STARTS:
                         return [f"the session ended {MOST_STARTS} times: {self._said()}"]
                     self._start()
@@ -307,7 +309,7 @@ class Tether(threading.Thread):
         number = len(self.camera.shots) + 1
         new = self.watched / f".{number:04d}.dng"
         self.camera.expose(new)
-        path, fault = self.watched / f"DSC_{number:04d}.dng", _camera_fault(self.folder)
+        path, fault = self.watched / f"DSC_{number:04d}.dng", _once(self.folder / "camera")
         match fault:
             case "slow":  # beyond all waiting, half the time
                 self._later(0.3 + 1.2 * (number % 2), new, path)
@@ -330,14 +332,14 @@ class Tether(threading.Thread):
         self.timers[-1].start()
 
 
-def _camera_fault(folder: Path) -> str:
-    """The fault that the camera shall have now, once."""
+def _once(path: Path) -> str:
+    """What a file says, which is then removed; empty where there is none."""
     try:
-        fault = (folder / "camera").read_text()
-        (folder / "camera").unlink()
+        text = path.read_text()
+        path.unlink()
     except OSError:
         return ""
-    return fault
+    return text
 
 
 # ---- the session's process -------------------------------------------------------------------------------------------
@@ -348,6 +350,7 @@ def take(folder: str) -> int:
     told = json.loads((Path(folder) / "session.json").read_text(encoding="utf-8"))
     plan = Plan(**{name: tuple(value) if isinstance(value, list) else value for name, value in told["plan"].items()})
     controller, config = Controller(**told["controller"]), StageConfig(**told["stage"])
+    repeat = tuple(int(text) for text in [_once(Path(folder) / "repeat")] if text)
     params = SessionParams(patience_s=30.0, retry_s=0.05, attempts=6, reserve_bytes=0)
     if os.name == "posix":
         threading.Thread(target=_fill_disk, args=(Path(folder) / "full",), daemon=True).start()
@@ -358,7 +361,7 @@ def take(folder: str) -> int:
                 camera = CableCamera(stage, Path(folder) / "watched", quick)
             else:
                 camera = _FaultyCamera(Path(folder), SimulatedWorld(controller, config), told["speed"])
-            session.run(plan, stage, camera, Path(folder) / "capture", params=params)
+            session.run(plan, stage, camera, Path(folder) / "capture", params=params, repeat=repeat)
     except StrandscopeError as error:
         print(f"{type(error).__name__}: {error}")
         return 1
@@ -377,7 +380,7 @@ class _FaultyCamera(VirtualCamera):
         with open(self.folder / "shots.jsonl", "a") as log:
             log.write(json.dumps(self.shots[-1]) + "\n")
         data = captured.path.read_bytes()
-        match _camera_fault(self.folder):
+        match _once(self.folder / "camera"):
             case "slow":
                 time.sleep(0.7)
             case "cut short":
