@@ -266,7 +266,7 @@ class Machine:
     def _clear(self) -> None:
         self.rx, self.task, self.waits = bytearray(), None, None
         self.blocks: deque[_Block] = deque()
-        self.block_halting = self.held = self.stopping = self.homing = self.critical = self.tells_to_reset = self.asked = False
+        self.block_halting = self.held = self.deaf = self.stopping = self.homing = self.critical = self.tells_to_reset = self.asked = False
         self.busy_until = self.now
         self.modal = {"motion": "G0", "distance": "G90", "units": "G21", "feed": 0.0}
         self.g92 = dict.fromkeys(self.axes, 0.0)
@@ -365,6 +365,7 @@ class Machine:
             self.state = "Hold" if self.state == "Run" else "Jog"
 
     def _resume(self) -> None:
+        self.deaf = False
         if self.state == "Hold" and self.held:
             self.held, self.state = False, "Idle"
             self._cycle()
@@ -384,7 +385,7 @@ class Machine:
             return False
         if self.asked and (self.hal or not (self.homing or self.critical)):
             return True
-        if self.critical or (not self.stopping and (self.state == "Hold" or self.block_halting)):
+        if self.critical or self.deaf or (not self.stopping and (self.state == "Hold" or self.block_halting)):
             return False
         return self._goes_on() if self.task else b"\n" in self.rx or b"\r" in self.rx
 
@@ -789,6 +790,10 @@ class Controller:
         """A button on the controller: "hold", "resume" or "reset"."""
         self._ask("press", button=button)
 
+    def deafen(self) -> None:
+        """It hears no lines until it is resumed, and says Idle: as GRBL where a jog is cancelled just when it ends."""
+        self._ask("deafen")
+
     def garbage(self, count: int = 40) -> None:
         """So many random bytes are put before what it says next."""
         self._ask("garbage", count=count)
@@ -1075,6 +1080,9 @@ class _Server:
 
     def _do_alarm(self, code: int) -> None:
         self.machine.alarm(code)
+
+    def _do_deafen(self) -> None:
+        self.machine.deaf = True
 
     def _do_press(self, button: str) -> None:
         self.machine.receive({"hold": grbl.HOLD, "resume": grbl.RESUME, "reset": grbl.RESET}[button])

@@ -26,7 +26,7 @@ ROUNDING = 0.0011  # units: reports have three decimals, and the firmware counts
 RESETS = 4  # until one is heard
 RESENDS = 3  # of lines that were refused because a jog had not ended, or were lost in a start
 GRACE_S = 0.5  # after an expected start, in which another welcome is no news
-CANCEL_S = 0.5  # between two requests to end a jog
+CANCEL_S = 0.5  # that a jog may go on after a hold before it is told to end
 LOST_AFTER = 8  # reports of one place, and no answer, after noise: the answer was lost
 QUICK_ASKS = 6  # questions that follow the answer at once, when a place is to be confirmed
 ALL, ALARMS, NOTHING = "all", "alarms", "nothing"  # what a wait heeds: everything, alarms that are called out, nothing
@@ -331,7 +331,9 @@ class Stage:
             for _ in range(3):  # a jog that has only just begun may not hear it
                 self._now(grbl.CANCEL_JOG)
                 with contextlib.suppress(StageLate):
-                    return self.wait(1.0 + 6 * self.config.poll_s)
+                    place = self.wait(1.0 + 6 * self.config.poll_s)
+                    self._now(grbl.RESUME)  # one that ended just then leaves GRBL Idle, but deaf to lines until it is resumed
+                    return place
             return self.wait()
 
     def wait(self, timeout_s: float | None = None) -> Place | None:
@@ -486,7 +488,7 @@ class Stage:
         self._restarted = False
         self._welcomes = self._reports = 0
         self._heard = self._asked = self._expected = time.monotonic()
-        self._cancelled = -CANCEL_S
+        self._jogged = 0.0  # since when a jog goes on that should end
 
     def _connect(self) -> None:
         """Open the port and wait for a sign of life: the welcome of a controller that restarts when its port is opened, or the
@@ -625,10 +627,11 @@ class Stage:
 
     def _stream(self, lines: list[str], timeout_s: float, what: str, heed: str, silence: bool) -> list[_Sent]:
         """Send lines, never more of them at a time than the controller's buffer holds (character counting)."""
-        waiting, sent, garbage = deque(lines), [], self._garbage
+        waiting, sent, garbage, nudged = deque(lines), [], self._garbage, False
         self._sent.clear()
 
         def done() -> bool:
+            nonlocal nudged
             while waiting and (not self._sent or sum(s.length for s in self._sent) + len(waiting[0]) + 1 <= self._window):
                 data = grbl.encode(waiting[0])
                 sent.append(_Sent(waiting.popleft(), len(data)))
@@ -636,7 +639,11 @@ class Stage:
                 self._connected().write(data)
                 if feed := re.fullmatch(r"(?:G53G1.*)?F(\d+)", sent[-1].line):
                     self._feeds.add(int(feed[1]))
-            lost = self._garbage > garbage and self._track.alike >= LOST_AFTER and self._track.state in ("Idle", "Alarm", "Check")
+            stuck = self._track.alike >= LOST_AFTER and self._track.state in ("Idle", "Alarm", "Check")
+            if stuck and self._sent and not nudged:  # Idle, but deaf: see cancel_jog. Does nothing else where nothing is held
+                nudged = True
+                self._now(grbl.RESUME)
+            lost = stuck and self._garbage > garbage
             return not waiting and (not self._sent or lost)
 
         self._wait(done, what, timeout_s, heed=heed, silence=silence)
@@ -800,10 +807,14 @@ class Stage:
         return track.state in grbl.PAUSED and ended
 
     def _halted(self) -> bool:
-        """Whether a hold, or what came of it, is over. grblHAL does not hold a jog, but ends it when told to."""
-        if self._track.state == "Jog" and time.monotonic() - self._cancelled > CANCEL_S:
-            self._cancelled = time.monotonic()
-            self._now(grbl.CANCEL_JOG)
+        """Whether a hold, or what came of it, is over. A jog, which GRBL ends by it, grblHAL only ends when told to."""
+        if self._track.state == "Jog":
+            self._jogged = self._jogged or time.monotonic()
+            if time.monotonic() - self._jogged > CANCEL_S:
+                self._jogged = 0.0
+                self._now(grbl.CANCEL_JOG)
+        else:
+            self._jogged = 0.0
         return self._held or self._track.state in ("Idle", "Alarm", "Check", "Sleep")
 
     def _must_know(self) -> None:

@@ -135,6 +135,13 @@ def test_a_jog_is_cancelled_where_it_is_and_a_move_may_follow_at_once(firmware):
         assert told.value.code == 15
 
 
+def test_a_controller_that_is_idle_but_deaf_is_nudged():
+    with rig() as (stage, controller):
+        controller.deafen()
+        stage.move_to(0, 7)
+        assert true(stage, controller, Place(0, 7))
+
+
 @pytest.mark.parametrize("firmware", [GRBL, GRBLHAL])
 def test_a_hold_is_no_delay_that_counts(firmware):
     said = []
