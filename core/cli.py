@@ -429,7 +429,7 @@ def capture(session, plan, folder, virtual, port, watch, name, repeat, patience,
       strandscope capture -o switch
       strandscope capture --pause -o switch
     """
-    from .rig import operate
+    from .rig import attach, operate
     from .rig import session as runs
 
     report = session.report
@@ -441,19 +441,19 @@ def capture(session, plan, folder, virtual, port, watch, name, repeat, patience,
     if folder is None and not dry_run:
         raise click.UsageError("missing option '-o': the folder of the capture")
     if order == "status":
-        told = runs.status(folder)
+        told = attach.status(folder)
         report.event(told)
-        report.show(terminal.table(runs.describe(told)))
+        report.show(terminal.table(attach.describe(told)))
         return
     if order:
-        runs.order(folder, order)
+        attach.order(folder, order)
         return
-    if repeat and not plan and runs.runs(folder):
+    if repeat and not plan and attach.runs(folder):
         for sweep in repeat:
-            runs.order(folder, runs.REPEAT, sweep=sweep)
+            attach.order(folder, attach.REPEAT, sweep=sweep)
         return
     params = runs.SessionParams(patience_s=patience)
-    orders = runs.Orders()
+    orders = attach.Orders()
     work = {"repeat": repeat, "orders": orders, "progress": report, "events": report.event}
     from . import virtual_rig
 
@@ -471,7 +471,7 @@ def capture(session, plan, folder, virtual, port, watch, name, repeat, patience,
     report.show(terminal.table(operate.describe(rig.plan)))
     if dry_run:
         return
-    with terminal.stops_politely(lambda: orders.add(runs.ABORT), report.note):
+    with terminal.stops_politely(lambda: orders.add(attach.ABORT), report.note):
         try:
             made = take()
         except runs.RunStopped as stopped:  # the run has said so

@@ -24,10 +24,11 @@ from .geometry import Optics
 from .groom import Groom, groom
 from .progress import Progress, silent
 from .raw import Shot, read_planes, write_dng
+from .rig.attach import RIG, Orders, Setup
 from .rig.camera import CameraSettings, CapturedFile, Tell, temporary
 from .rig.controller import Controller, ControllerConfig, stage_config, start_controller
 from .rig.plan import SWEEP, Exposure, Place, Plan
-from .rig.session import RIG, Orders, SessionParams, Setup, run
+from .rig.session import SessionParams, run
 from .rig.stage import Stage
 from .rig.wiring import StageConfig
 from .simulate import BLACK, JOURNAL, WHITE, Drawing, Scale, SimulateParams, Studio, begin, lock_params, prepare, studio, take_truth

@@ -10,9 +10,10 @@ from pathlib import Path
 
 from ..errors import StrandscopeError
 from ..progress import Progress, silent
+from .attach import RIG, Orders, Setup, duration
 from .camera import CableConfig, Camera, CameraError, GphotoConfig, cable_camera, gphoto_camera
 from .plan import CHECK, Plan, load_plan, read_table, save_plan
-from .session import RIG, Orders, SessionParams, Setup, duration, run
+from .session import SessionParams, run
 from .stage import Stage
 from .watch import sharpness, write_picture
 from .wiring import StageConfig, load_stage

@@ -28,40 +28,22 @@ import numpy as np
 
 from ..capture import FILE_NAME, Capture, Sweep, Turntable, save_capture
 from ..errors import CaptureError, StrandscopeError
-from ..files import explain, is_held, only_one, sync_folder
+from ..files import explain, only_one, sync_folder
 from ..geometry import Optics
 from ..progress import Progress, silent
 from ..raw import Header, read_header, read_planes
-from . import logbook
+from .attach import ABORT, EVENTS, LAST, LOCK, LOGBOOK, ORDERS, PAUSE, REPEAT, RESUME, RIG, Key, Orders, Setup, Story, replay
 from .camera import Camera, CameraAsleep, CameraError, CameraGone, CapturedFile, settings_of
 from .logbook import Logbook
 from .plan import CHECK, TURNTABLE, Exposure, Plan
 from .stage import Place, PositionLost, Stage, StageAlarm, StageError, StageLost
 from .watch import Sight, Watch, WatchParams, look, write_picture
 
-RIG = "rig"
-LOGBOOK, EVENTS, ORDERS = f"{RIG}/logbook.jsonl", f"{RIG}/events.jsonl", f"{RIG}/orders.jsonl"
-LOCK, ASIDE, INCOMING = f"{RIG}/lock", f"{RIG}/aside", f"{RIG}/incoming"
-LAST = f"{RIG}/last.png"  # the last photograph, small, for those who watch
+ASIDE, INCOMING = f"{RIG}/aside", f"{RIG}/incoming"
 LAST_EVERY_S = 1.0
-PAUSE, RESUME, ABORT, REPEAT = "pause", "resume", "abort", "repeat"
 STILL_MM, STILL_DEG = 0.005, 0.02  # nearer than this to its place the stage stands there
 STOPS_OFF = 0.4  # an exposure that differs by more, in factors of two, is another
 REMEMBERED = 100  # photographs from whose pace the remaining time is told
-
-Key = tuple[str, int, int]  # kind, sweep, frame of an exposure
-
-
-@dataclass(frozen=True)
-class Setup:
-    """What capture.json says of the optics, beside the photographs; ``axis_*`` None: the middle of a photograph."""
-
-    name: str = ""  # empty: the folder's
-    working_distance_mm: float = 330.0
-    pitch_mm: float = 1 / 35
-    axis_col_px: float | None = None
-    axis_row_px: float | None = None
-    aperture_cone_deg: float = 10.0
 
 
 @dataclass(frozen=True)
@@ -89,132 +71,6 @@ COMES_BACK = (StageLost, PositionLost, CameraGone, CameraAsleep, DiskFull)  # by
 
 class RunStopped(StrandscopeError):
     """The run ended because it was asked to; it can be gone on with."""
-
-
-class Orders:
-    """What a run is asked to do: by this process (``add``, from any thread or signal handler), or by lines in a file."""
-
-    def __init__(self):
-        self._own: deque[dict] = deque()
-        self._file: Path | None = None
-        self._read = 0
-
-    def add(self, what: str, **fields) -> None:
-        self._own.append({"order": what, **fields})
-
-    def listen(self, path: Path) -> None:
-        """Also take the orders that are written to a file from now on."""
-        self._file, self._read = path, path.stat().st_size if path.exists() else 0
-
-    def take(self) -> list[dict]:
-        """The orders since the last call."""
-        orders = [self._own.popleft() for _ in range(len(self._own))]
-        if self._file and self._file.exists():
-            with open(self._file, "rb") as file:
-                file.seek(self._read)
-                data = file.read()
-            whole = data[: data.rfind(b"\n") + 1]
-            self._read += len(whole)
-            for line in whole.splitlines():
-                try:
-                    order = json.loads(line)
-                except ValueError:
-                    continue
-                if isinstance(order, dict):
-                    orders.append(order)
-        return orders
-
-
-def order(folder: Path, what: str, **fields) -> None:
-    """Ask the run that takes the capture in ``folder`` to pause, resume, abort, or repeat a sweep. Raises StrandscopeError where none runs."""
-    folder = Path(folder)
-    if not is_held(folder / LOCK):
-        raise StrandscopeError(f"{folder}: no capture is running there; `strandscope capture -o {folder}` goes on with it")
-    try:
-        with open(folder / ORDERS, "ab") as file:
-            file.write(json.dumps({"order": what, **fields}).encode() + b"\n")
-    except OSError as error:
-        raise explain(error, folder / ORDERS) from error
-
-
-def status(folder: Path) -> dict:
-    """What a capture's run said last, with ``running``, and ``done`` of ``total`` photographs that are safe. Raises StrandscopeError
-    where there is no capture."""
-    folder = Path(folder)
-    try:
-        records, _ = logbook.read((folder / LOGBOOK).read_bytes())
-    except OSError as error:
-        raise StrandscopeError(f"{folder}: holds no capture of a rig; expected {LOGBOOK} in it") from error
-    story = replay(records)
-    last = {}
-    if (folder / EVENTS).exists():
-        for line in (folder / EVENTS).read_bytes().splitlines()[-50:]:
-            try:
-                event = json.loads(line)
-            except ValueError:  # a last line that is being written
-                continue
-            if event.get("event") == "capture":
-                last = event
-    running = is_held(folder / LOCK)
-    if not running and last.get("state") not in ("done", "stopped", "failed", None):
-        last = {**last, "state": "ended", "message": "the program ended in the middle; go on with the same command"}
-    total = sum(len(plan) for plan in story.plans.values())
-    return {**last, "event": "capture", "running": running, "done": len(story.safe), "total": total}
-
-
-def runs(folder: Path) -> bool:
-    """Whether a run takes the capture in ``folder`` now."""
-    return is_held(Path(folder) / LOCK)
-
-
-def describe(told: dict) -> list[tuple[str, str]]:
-    """Rows (name, value) for people of what ``status`` tells."""
-    rows = [("photographs", f"{told['done']} of {told['total']} safe"), ("state", told.get("state", "begun") if told["running"] else "no run")]
-    if not told["running"] and "state" in told:
-        rows.append(("last run", told["state"]))
-    if "sweep" in told:
-        rows.append(("last", f"{told['kind']} {told['sweep']}, photograph {told['frame']}, at {told['angle_deg']:g}°, {told['position_mm']:g} mm"))
-    if told["running"] and "remaining_s" in told:
-        rows.append(("remaining", duration(told["remaining_s"])))
-    if told.get("message"):
-        rows.append(("said", told["message"]))
-    return rows
-
-
-def duration(seconds: float) -> str:
-    """Hours and minutes, or minutes and seconds."""
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min {rest:02d} s"
-
-
-# ---- what the logbook says -------------------------------------------------------------------------------------------
-
-
-@dataclass
-class Story:
-    """What the records of a logbook amount to."""
-
-    plans: dict[str, Plan]  # by kind
-    setup: Setup
-    safe: dict[Key, dict]  # the record of each photograph that is proven safe
-
-
-def replay(records: list[dict]) -> Story:
-    """What a logbook says, read from its beginning."""
-    story = Story({}, Setup(), {})
-    for record in records:
-        match record["what"]:
-            case "plan":
-                story.plans[record["plan"]["kind"]] = _dataclass(Plan, record["plan"])
-                story.setup = _dataclass(Setup, record["setup"])
-            case "safe":
-                story.safe[_key_of(record)] = record
-            case "undone":
-                story.safe.pop(_key_of(record), None)
-            case "repeat":
-                for key in [key for key in story.safe if key[0] != TURNTABLE and key[1] == record["sweep"]]:
-                    del story.safe[key]
-    return story
 
 
 def key(exposure: Exposure) -> Key:
@@ -731,18 +587,8 @@ def _place(place: Place | None) -> dict:
     return {} if place is None else {"angle_deg": place.angle_deg, "position_mm": place.position_mm}
 
 
-def _key_of(record: dict) -> Key:
-    return record["kind"], record["sweep"], record["frame"]
-
-
 def _words(key: Key) -> str:
     return f"{key[0]} {key[1]}, frame {key[2]}"
-
-
-def _dataclass(kind, values: dict):
-    """A dataclass out of JSON: fields that it does not have are left out, lists become tuples."""
-    names = {f.name for f in fields(kind)}
-    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items() if name in names})
 
 
 def _sha256(path: Path) -> str:

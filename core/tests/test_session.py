@@ -11,11 +11,12 @@ import pytest
 from strandscope.core.capture import load_capture
 from strandscope.core.errors import StrandscopeError
 from strandscope.core.raw import write_dng
-from strandscope.core.rig import session
+from strandscope.core.rig import attach, session
+from strandscope.core.rig.attach import ABORT, PAUSE, REPEAT, RESUME, Orders
 from strandscope.core.rig.camera import CameraAsleep, CameraGone
 from strandscope.core.rig.logbook import Logbook, read
 from strandscope.core.rig.plan import Place, Plan, turntable_plan
-from strandscope.core.rig.session import ABORT, PAUSE, REPEAT, RESUME, Orders, RunStopped, SessionParams, run
+from strandscope.core.rig.session import RunStopped, SessionParams, run
 from strandscope.core.rig.stage import PositionLost, StageAlarm, StageLost
 from strandscope.core.rig.wiring import StageConfig
 from strandscope.core.virtual_rig import VirtualCamera, VirtualCameraConfig, read_stamp, stamped
@@ -135,8 +136,8 @@ def test_a_plan_is_taken_and_reads_as_a_capture(tmp_path, rig):
     assert states[0] == "connecting"
     assert states[-1] == "done"
     assert told[-1]["done"] == told[-1]["total"] == 8
-    assert session.status(tmp_path)["state"] == "done"
-    assert not session.status(tmp_path)["running"]
+    assert attach.status(tmp_path)["state"] == "done"
+    assert not attach.status(tmp_path)["running"]
 
 
 def test_a_listener_that_is_gone_does_not_end_a_capture(tmp_path, rig):
@@ -277,7 +278,7 @@ def test_patience_ends(tmp_path, rig):
         run(PLAN, stage, camera, tmp_path, params=replace(QUICK, patience_s=60.0), clock=lambda: float(next(now)), events=told.append)
     assert 10 < len(camera.shots) < 100
     assert sum("unplugged; trying" in event.get("message", "") for event in told) == 1  # said once
-    assert session.status(tmp_path)["state"] == "failed"
+    assert attach.status(tmp_path)["state"] == "failed"
 
 
 def test_a_full_disk_is_waited_for_and_said_before(tmp_path, rig, monkeypatch):
@@ -297,15 +298,15 @@ def test_a_full_disk_is_waited_for_and_said_before(tmp_path, rig, monkeypatch):
 def test_pause_abort_and_repeat_by_another_process(tmp_path, rig):
     stage, camera = rig
     with pytest.raises(StrandscopeError, match="no capture is running"):
-        session.order(tmp_path, PAUSE)
+        attach.order(tmp_path, PAUSE)
 
     def ordered(*orders):
-        return lambda _path: [session.order(tmp_path, *what[:1], **dict(what[1:])) for what in orders]
+        return lambda _path: [attach.order(tmp_path, *what[:1], **dict(what[1:])) for what in orders]
 
     camera.faults = {5: ordered((PAUSE,), (REPEAT, ("sweep", 0)), (RESUME,)), 9: ordered((ABORT,))}
     with pytest.raises(RunStopped, match=r"goes on"):
         run(PLAN, stage, camera, tmp_path, params=QUICK)
-    assert session.status(tmp_path)["state"] == "stopped"
+    assert attach.status(tmp_path)["state"] == "stopped"
     assert len(camera.shots) == 9
     run(None, stage, camera, tmp_path, params=QUICK)
     expect_whole(tmp_path, PLAN)
@@ -323,7 +324,7 @@ def test_a_paused_run_takes_nothing_until_it_is_resumed(tmp_path, rig):
         "params": QUICK, "orders": orders, "events": lambda e: paused.set() if e.get("state") == "paused" else None})  # fmt: skip
     thread.start()
     assert paused.wait(20)
-    assert session.status(tmp_path)["running"]
+    assert attach.status(tmp_path)["running"]
     assert len(camera.shots) == 2
     with pytest.raises(StrandscopeError, match="another run takes this capture"):
         run(PLAN, stage, camera, tmp_path, params=QUICK)

@@ -17,7 +17,7 @@ from strandscope.core.capture import load_capture
 from strandscope.core.cli import run as strandscope
 from strandscope.core.errors import StrandscopeError
 from strandscope.core.raw import read_header, read_planes
-from strandscope.core.rig import operate, session
+from strandscope.core.rig import attach, operate, session
 from strandscope.core.rig.camera import CableConfig, CameraSettings, cable_camera, settings_of
 from strandscope.core.rig.controller import ControllerConfig, stage_config, start_controller
 from strandscope.core.rig.operate import CameraConfig, Rig, load_rig, save_rig
@@ -202,7 +202,7 @@ def program(*arguments, **how) -> subprocess.Popen:
 def until(folder: Path, wanted, child: subprocess.Popen) -> dict:
     """What ``--status`` tells, as soon as it is as wanted."""
     for _ in range(600):
-        if (folder / session.LOGBOOK).exists() and wanted(told := session.status(folder)):
+        if (folder / session.LOGBOOK).exists() and wanted(told := attach.status(folder)):
             return told
         assert child.poll() is None, child.communicate()
         time.sleep(0.05)
@@ -233,5 +233,5 @@ def test_ctrl_c_ends_a_capture_after_its_photograph_and_the_same_command_goes_on
     assert {"progress", "capture", "note"} <= {event["event"] for event in events}
     assert [e["state"] for e in events if e["event"] == "capture"][-1] == "stopped"
     for record in before.values():  # nothing was taken again
-        assert session.replay(session.logbook.read((folder / session.LOGBOOK).read_bytes())[0]).safe[session._key_of(record)] == record
+        assert session.replay(session.logbook.read((folder / session.LOGBOOK).read_bytes())[0]).safe[attach.key_of(record)] == record
         assert read_planes(folder / record["file"]).shape == (1, 180, 150)
