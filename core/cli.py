@@ -461,8 +461,8 @@ def capture(session, plan, folder, virtual, port, watch, name, repeat, patience,
     if virtual or hair:
         from .simulate import SimulateParams
 
-        hair = hair or SimulateParams(style, scale, seed=seed)
-        rig = operate.Rig(plan=operate.load_rig(plan).plan if plan else virtual_rig.virtual_plan(hair))
+        hair, begun = hair or SimulateParams(style, scale, seed=seed), attach.plan_in(folder) if folder else None
+        rig = operate.Rig(plan=operate.load_rig(plan).plan if plan else begun or virtual_rig.virtual_plan(hair))
         take = partial(virtual_rig.virtual_capture, folder, virtual_rig.VirtualParams(hair, speed), rig.plan, params, **work)
     else:
         rig = operate.load_rig(plan) if plan else operate.load_rig(folder / operate.FILE) if folder else operate.Rig()
@@ -477,6 +477,54 @@ def capture(session, plan, folder, virtual, port, watch, name, repeat, patience,
         except runs.RunStopped as stopped:  # the run has said so
             raise click.exceptions.Exit(INTERRUPTED) from stopped
     report.done(made)
+
+
+@main_group.command("rig", short_help="Move a rig by hand: home, jog, look.")
+@click.argument("plan", type=PATH, required=False, metavar="[PLAN.toml]")
+@click.option("--ports", is_flag=True, help="List this machine's serial ports, and end.")
+@click.option("--virtual", is_flag=True, help="A simulated controller, camera and lock of hair.")
+@click.option("--port", metavar="URL", help="Of the controller: /dev/ttyUSB0, COM3, socket://host:port, …  [default: that of the plan]")
+@click.option("--picture", type=PATH, default=Path("live.png"), show_default=True, metavar="PICTURE.png", help="Where live pictures are written.")
+@click.option("--style", type=click.Choice(["straight", "wavy", "curls"]), default="straight", show_default=True, help="Virtual hair.")
+@click.option("--scale", type=click.Choice(["tiny", "small", "medium"]), default="tiny", show_default=True, help="Size of the virtual hair.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Another number gives another virtual lock.")
+@click.option("--speed", type=POSITIVE, default=4.0, show_default=True, help="The virtual rig's time goes so many times as fast.")
+@common
+@click.pass_obj
+def by_hand(session, plan, ports, virtual, port, picture, style, scale, seed, speed):
+    """Move a rig by commands, one a line on standard input, and show what its camera sees; for framing and focusing.
+
+    \b
+    Commands:
+      home         find the position with the switches      jog MM      move the focus by so much
+      unlock       take back an alarm                       turn DEG    turn the turntable by so much
+      stop         halt at once                             go DEG MM   go there
+      live on|off  write the live picture again and again   shutter     fire the shutter cable
+      quit         end
+
+    \b
+    Examples:
+      strandscope rig --virtual
+      strandscope rig switch.toml --port /dev/ttyUSB0
+    """
+    from .rig import desk, operate
+
+    report = session.report
+    if ports:
+        found = desk.ports()
+        report.event({"event": "ports", "ports": found})
+        report.show(terminal.table(found) if found else "no serial port was found")
+        return
+    rig = operate.changed(operate.load_rig(plan) if plan else operate.Rig(), port)
+    commands = iter(sys.stdin.readline, "")
+    if virtual:
+        from . import virtual_rig
+        from .simulate import SimulateParams
+
+        params = virtual_rig.VirtualParams(SimulateParams(style, scale, seed=seed), speed)
+        virtual_rig.virtual_by_hand(params, rig.plan if plan else None, commands, picture, report.event)
+    else:
+        operate.by_hand(rig, commands, picture, report.event)
 
 
 @main_group.command(short_help="Find the hairs in a capture, write them as curves.")

@@ -8,7 +8,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -24,6 +24,7 @@ from .geometry import Optics
 from .groom import Groom, groom
 from .progress import Progress, silent
 from .raw import Shot, read_planes, write_dng
+from .rig import desk
 from .rig.attach import RIG, Orders, Setup
 from .rig.camera import CameraSettings, CapturedFile, Tell, temporary
 from .rig.controller import Controller, ControllerConfig, stage_config, start_controller
@@ -195,6 +196,20 @@ def virtual_capture(
             camera = VirtualCamera(photographer(camera_of), SimulatedWorld(controller, place), VirtualCameraConfig(params.speed))
             listeners = {"orders": orders, "progress": progress, "events": events}
             return run(plan, stage, camera, folder, virtual_setup(params.hair), session or SessionParams(), repeat=repeat, **listeners)
+
+
+def virtual_by_hand(params: VirtualParams, plan: Plan | None, commands: Iterable[str], picture: Path, events: Callable[[dict], None]) -> None:
+    """Move a virtual rig by commands, as ``rig.operate.by_hand`` moves a real one."""
+    config = ControllerConfig(time_factor=params.speed)
+    with start_controller(config) as controller:
+        place = stage_config(controller.url, config)
+
+        def camera() -> VirtualCamera:
+            hair = photographer(virtual_studio(params.hair))
+            return VirtualCamera(hair, SimulatedWorld(controller, place), VirtualCameraConfig(params.speed))
+
+        with Stage.open(place) as stage:
+            desk.attend(stage, camera, plan or virtual_plan(params.hair), commands, picture, events)
 
 
 def hair_in(folder: Path) -> SimulateParams | None:

@@ -17,7 +17,7 @@ from .plan import TURNTABLE, Plan
 RIG = "rig"
 LOGBOOK, EVENTS, ORDERS = f"{RIG}/logbook.jsonl", f"{RIG}/events.jsonl", f"{RIG}/orders.jsonl"
 LOCK = f"{RIG}/lock"
-SAID = f"{RIG}/run.log"  # what a run that was started beside the panel printed
+SAID = f"{RIG}/run.log"  # what a run that the panel started prints
 LAST = f"{RIG}/last.png"  # the last photograph, small, for those who watch
 PAUSE, RESUME, ABORT, REPEAT = "pause", "resume", "abort", "repeat"
 
@@ -67,8 +67,11 @@ class Orders:
 class Follower:
     """What the run in a folder tells, from the beginning of ``rig/events.jsonl`` on, a piece at a time."""
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, skip: bool = False):
+        """``skip``: what the last run told is no news."""
         self._path, self._read, self._first = Path(folder) / EVENTS, 0, b""
+        if skip:
+            self.read()
 
     def read(self) -> tuple[bool, list[dict]]:
         """Whether another run has begun since the last call, and the events since then, or of it."""
@@ -88,7 +91,7 @@ class Follower:
 
 
 def last_words(folder: Path) -> str:
-    """The error with which the run in a folder ended, empty where it told none; of runs that were started by ``launch``."""
+    """The error with which the run in a folder ended, empty where it told none; of runs that print to ``rig/run.log``."""
     try:
         data = (Path(folder) / SAID).read_bytes()
     except OSError:
@@ -185,6 +188,21 @@ def replay(records: list[dict]) -> Story:
                 for key in [key for key in story.safe if key[0] != TURNTABLE and key[1] == record["sweep"]]:
                     del story.safe[key]
     return story
+
+
+def plan_in(folder: Path) -> Plan | None:
+    """The plan that a capture in ``folder`` is gone on with: the first that has photographs missing; None where there is none."""
+    try:
+        records, _ = logbook.read((Path(folder) / LOGBOOK).read_bytes())
+    except OSError:
+        return None
+    return open_plan(replay(records))
+
+
+def open_plan(story: Story) -> Plan | None:
+    """The first plan of which photographs are missing, else the first; None where there is none."""
+    missing = (p for p in story.plans.values() if any((e.kind, e.sweep, e.frame) not in story.safe for e in p.exposures()))
+    return next(missing, next(iter(story.plans.values()), None))
 
 
 def key_of(record: dict) -> Key:

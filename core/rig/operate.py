@@ -4,12 +4,13 @@ The TOML file has the tables ``plan``, ``stage``, ``camera`` and ``optics``. A c
 it is gone on with by naming its folder alone.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 from ..errors import StrandscopeError
 from ..progress import Progress, silent
+from . import desk
 from .attach import RIG, Orders, Setup, duration
 from .camera import CableConfig, Camera, CameraError, GphotoConfig, cable_camera, gphoto_camera
 from .plan import CHECK, Plan, load_plan, read_table, save_plan
@@ -118,6 +119,12 @@ def capture(
             return run(rig.plan, stage, camera, folder, rig.setup, params or SessionParams(), repeat=repeat, **listeners)
         finally:
             camera.close()
+
+
+def by_hand(rig: Rig, commands: Iterable[str], picture: Path, events: Callable[[dict], None]) -> None:
+    """Move a rig by commands, a line each, and show what its camera sees; see ``desk``. Raises StageLost where no controller answers."""
+    with Stage.open(rig.stage) as stage:
+        desk.attend(stage, lambda: open_camera(rig.camera, stage), rig.plan, commands, picture, events)
 
 
 def live(camera: Camera, picture: Path, events: Callable[[dict], None], stop: Callable[[], bool] = lambda: False) -> None:

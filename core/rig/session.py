@@ -32,7 +32,7 @@ from ..files import explain, only_one, sync_folder
 from ..geometry import Optics
 from ..progress import Progress, silent
 from ..raw import Header, read_header, read_planes
-from .attach import ABORT, EVENTS, LAST, LOCK, LOGBOOK, ORDERS, PAUSE, REPEAT, RESUME, RIG, Key, Orders, Setup, Story, replay
+from .attach import ABORT, EVENTS, LAST, LOCK, LOGBOOK, ORDERS, PAUSE, REPEAT, RESUME, RIG, Key, Orders, Setup, Story, open_plan, replay
 from .camera import Camera, CameraAsleep, CameraError, CameraGone, CapturedFile, settings_of
 from .logbook import Logbook
 from .plan import CHECK, TURNTABLE, Exposure, Plan
@@ -438,8 +438,7 @@ class _Run:
         if plan is None:
             if not plans:
                 raise StrandscopeError(f"{self.folder}: holds no capture to go on with; expected a plan")
-            unfinished = (p for p in plans.values() if any(key(e) not in self.story.safe for e in p.exposures()))
-            return next(unfinished, next(iter(plans.values())))
+            return open_plan(self.story)
         before = plans.get(plan.kind)
         if before is not None:
             for f in fields(Plan):
