@@ -4,7 +4,7 @@ import textwrap
 
 import bpy
 
-from . import hair
+from . import hair, rig
 
 _CHARACTERS = 0.14  # of text that fit in a pixel of width, at a scale of the interface of 1
 
@@ -54,7 +54,7 @@ class STRANDSCOPE_PT_capture(Tab, bpy.types.Panel):
             column = layout.column()
             text(column, context, settings.capture_name, icon="OUTLINER_OB_CURVES")
             text(column, context, settings.capture_facts, icon="BLANK1")
-        else:
+        elif not rig.desk.running:
             layout.operator("strandscope.import_capture", icon="IMPORT")
 
 

@@ -6,9 +6,10 @@ from ..core.errors import StrandscopeError
 from . import pictures, rig
 from .operators.rig import plan_of
 from .panels import Tab, text
+from .props import duration_left
 
 PICTURE = 8.5  # size, in heights of a button
-SHOWN = 3  # warnings at a time
+SHOWN = 2  # warnings at a time
 STATES = {  # of a rig that is moved by hand
     "connecting": ("Connecting …", "SORTTIME"),
     "homing": ("Homing …", "HOME"),
@@ -21,7 +22,7 @@ RUNS = {  # of a capture
     "starting": "Starting",
     "connecting": "Connecting",
     "homing": "Homing",
-    "paused": "Paused",
+    "paused": "Paused: do not touch the hair",
     "waiting": "Waiting",
     "done": "All photographs are there",
     "stopped": "Ended, as asked",
@@ -157,11 +158,11 @@ class STRANDSCOPE_PT_frame(_Below, bpy.types.Panel):
             share = hand.sharpness / hand.best if hand.best else 0.0
             column.progress(factor=share, type="BAR", text=f"Sharpness {1000 * hand.sharpness:.1f}, best {1000 * hand.best:.1f}")
         settings = context.scene.strandscope_rig
-        column = layout.column(align=True)
-        for side, prop in (("NEAR", "near_mm"), ("FAR", "far_mm")):
+        column = _split(layout.column())
+        for side, prop, name in (("FAR", "far_mm", "Far (mm)"), ("NEAR", "near_mm", "Near (mm)")):
             row = column.row(align=True)
-            row.prop(settings, prop)
-            row.operator("strandscope.rig_mark", text="Here", icon="EYEDROPPER").side = side
+            row.prop(settings, prop, text=name)
+            row.operator("strandscope.rig_mark", text="", icon="EYEDROPPER").side = side
 
 
 class STRANDSCOPE_PT_plan(_Below, bpy.types.Panel):
@@ -183,13 +184,14 @@ class STRANDSCOPE_PT_plan(_Below, bpy.types.Panel):
         column.prop(settings, "iso")
         column.prop(settings, "check_shots")
         try:
-            photographs, time, size = rig.cost(plan_of(context))
+            photographs, seconds, size = rig.cost(plan_of(context))
         except StrandscopeError as error:
             _alert(layout, context, str(error))
             return
         column = layout.column(align=True)
         text(column, context, photographs, icon="RENDERLAYERS")
-        text(column, context, time, icon="TIME")
+        pace = settings.speed if settings.kind == "VIRTUAL" else 1.0
+        text(column, context, rig.attach.duration(seconds / pace), icon="TIME")
         free = rig.free_bytes(settings.folder_path if settings.folder else rig.scratch())
         row = column.column()
         row.alert = free is not None and free < size
@@ -214,9 +216,9 @@ class STRANDSCOPE_PT_photographs(_Below, bpy.types.Panel):
         column.prop(settings, "folder", placeholder="A new folder")
         if settings.begun:
             text(column, context, settings.begun, icon="CHECKMARK" if settings.complete else "INFO")
-        else:
+        elif settings.kind == "FILE":
             column.prop(settings, "name", placeholder="Of the folder")
-        if settings.kind == "VIRTUAL":
+        if settings.kind == "VIRTUAL" and not settings.complete:
             column.prop(settings, "speed")
         row = layout.row()
         row.scale_y = 1.3
@@ -238,10 +240,10 @@ class STRANDSCOPE_PT_photographs(_Below, bpy.types.Panel):
             head.operator("strandscope.rig_dismiss", text="", icon="X", emboss=False)
         else:
             head.progress(factor=done / total if total else 0.0, type="BAR", text=f"{done} of {total}" if total else f"{RUNS[state]} …")
-        if run and run.message:
-            _alert(layout, context, run.message, icon="ERROR" if state != "stopped" else "INFO")
         if rig.desk.running:
             self._progress(layout, told, state)
+        if failed or state == "waiting":
+            _alert(layout, context, run.message)
         shown = pictures.icon(run.picture) if run else 0
         if shown:
             column = layout.column(align=True)
@@ -269,8 +271,8 @@ class STRANDSCOPE_PT_photographs(_Below, bpy.types.Panel):
             column.label(text=RUNS[state], icon="PAUSE" if state == "paused" else "SORTTIME")
         elif "sweep" in told:
             column.label(text=f"Sweep {told['sweep']} at {told['angle_deg']:g}°", icon="FILE_REFRESH")
-        if told.get("remaining_s"):
-            column.label(text=f"{rig.attach.duration(told['remaining_s'])} left", icon="TIME")
+        if told.get("remaining_s") and state != "waiting":
+            column.label(text=duration_left(told["remaining_s"]), icon="TIME")
 
 
 def _repeat(layout, settings) -> None:
@@ -289,14 +291,14 @@ def _size(count: float) -> str:
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
 
 
-_CLASSES = (STRANDSCOPE_PT_rig, STRANDSCOPE_PT_frame, STRANDSCOPE_PT_plan, STRANDSCOPE_PT_photographs)
+CLASSES = (STRANDSCOPE_PT_rig, STRANDSCOPE_PT_frame, STRANDSCOPE_PT_plan, STRANDSCOPE_PT_photographs)
 
 
 def register():
-    for cls in _CLASSES:
+    for cls in CLASSES:
         bpy.utils.register_class(cls)
 
 
 def unregister():
-    for cls in reversed(_CLASSES):
+    for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -31,7 +31,7 @@ def icon(path: Path | None) -> int:
     if _shown.times.get(name) != time:
         if name in _shown.previews:
             del _shown.previews[name]
-        _shown.previews.load(name, name, "IMAGE", force_reload=True)
+        tuple(_shown.previews.load(name, name, "IMAGE", force_reload=True).image_size)  # asked for, it is read at once
         _shown.times[name] = time
     return _shown.previews[name].icon_id
 

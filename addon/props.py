@@ -98,7 +98,7 @@ def _rig_changed(rig, _context):
 
 def _folder_changed(rig, _context):
     """How far the capture in the folder is, if there is one."""
-    rig.begun = ""
+    rig.begun, rig.complete = "", False
     if not rig.folder:
         return
     with contextlib.suppress(StrandscopeError):  # there is none yet
@@ -119,8 +119,8 @@ class STRANDSCOPE_PG_rig(bpy.types.PropertyGroup):
     kind: EnumProperty(
         name="Rig",
         items=(
-            ("FILE", "Rig", "A camera on a stage, and a turntable, on a controller"),
-            ("VIRTUAL", "Virtual Rig", "A simulated controller and camera, and a simulated lock of hair"),
+            ("FILE", "Real", "A camera on a stage, and a turntable, on a controller"),
+            ("VIRTUAL", "Virtual", "A simulated controller and camera, and a simulated lock of hair"),
         ),
         update=_kind_changed,
     )
@@ -189,7 +189,7 @@ class STRANDSCOPE_PG_job(bpy.types.PropertyGroup):
 
     def show(self, stage: str, fraction: float, remaining_s: float | None, stopping: bool) -> None:
         self.stage = "Stopping" if stopping else stage[:1].upper() + stage[1:]
-        self.fraction, self.remaining = fraction, "" if remaining_s is None or stopping else _duration(remaining_s)
+        self.fraction, self.remaining = fraction, "" if remaining_s is None or stopping else duration_left(remaining_s)
 
     def end(self) -> None:
         self.running = self.stop = False
@@ -226,7 +226,7 @@ def preferences(context):
     return addon.preferences if addon and addon.preferences else _Defaults
 
 
-def _duration(seconds: float) -> str:
+def duration_left(seconds: float) -> str:
     """How long something still takes, in words."""
     if seconds < 90:
         return f"{max(round(seconds), 1)} s left"

@@ -298,11 +298,11 @@ def with_fields(base: Plan, angles: int, far_mm: float, near_mm: float, step_mm:
 
 
 @lru_cache(8)
-def cost(plan: Plan) -> tuple[str, str, float]:
-    """What a plan takes: photographs and time, in words, and bytes."""
+def cost(plan: Plan) -> tuple[str, float, int]:
+    """What a plan takes: photographs, in words, seconds, and bytes."""
     checks = sum(exposure.kind == CHECK for exposure in plan.exposures())
     photographs = f"{len(plan) - checks:,} photographs".replace(",", " ") + (f" and {checks} checks" if checks else "")
-    return photographs, attach.duration(plan.duration_s()), plan.disk_bytes()
+    return photographs, plan.duration_s(), plan.disk_bytes()
 
 
 def free_bytes(folder: Path) -> int | None:

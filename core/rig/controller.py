@@ -846,11 +846,12 @@ class Controller:
 
 
 def start_controller(config: ControllerConfig | None = None, transport: str = "", linger_s: float = 120.0) -> Controller:
-    """Start a controller in a process of its own; ``transport`` is "pty" (a serial port; not on Windows) or "tcp".
+    """Start a controller in a process of its own; ``transport`` is "pty" (a serial port; not on Windows) or "tcp"; the
+    first that there is.
 
     It ends by ``end()``, or when nobody has spoken to it for ``linger_s``. Raises StrandscopeError where it does not start.
     """
-    config, transport = config or ControllerConfig(), transport or ("pty" if os.name == "posix" else "tcp")
+    config, transport = config or ControllerConfig(), transport or ("pty" if _has_ptys() else "tcp")
     code = (
         "import runpy, sys; runpy.run_path(sys.argv.pop(1), run_name='worker'); "
         "from strandscope.core.rig.controller import main; sys.exit(main(sys.argv[1:]))"
@@ -866,6 +867,16 @@ def start_controller(config: ControllerConfig | None = None, transport: str = ""
     child.stderr.close()
     child.returncode = 0  # it is nobody's child from here on: it outlives us, and we do not wait for it
     return Controller(**json.loads(line))
+
+
+def _has_ptys() -> bool:
+    """Whether the system gives out pseudo-terminals: Windows does not, nor do some containers."""
+    try:
+        for handle in os.openpty():
+            os.close(handle)
+    except (AttributeError, OSError):
+        return False
+    return True
 
 
 class _Port:
