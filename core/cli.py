@@ -230,6 +230,10 @@ def main_group():
 @click.option("--working-distance-off-mm", type=float, metavar="MM", help="The plane of focus is farther from the lens.  [misaligned: 2]")
 @click.option("--turntable-step-off-deg", type=float, metavar="DEG", help="One step, in the middle, turns too far.  [misaligned: 0.1]")
 @click.option("--every-step-off-deg", type=float, metavar="DEG", help="Every step turns too far.  [misaligned: 0]")
+@click.option("--pitch-off", type=float, metavar="PARTS", help="A pixel is wider on the plane of focus.  [misaligned: 0]")
+@click.option("--travel-deg", type=float, metavar="DEG", help="The stage leads the camera to the right of its line of sight.  [misaligned: 0]")
+@click.option("--travel-up-deg", type=float, metavar="DEG", help="And upwards.  [misaligned: 0]")
+@click.option("--distortion", type=float, metavar="K1", help="The lens distorts: k1, in 1/mm².  [misaligned: 0]")
 @click.option("--gain-drift", type=float, metavar="PARTS", help="Photographs gain light from the first to the last of a sweep.  [misaligned: 0.05]")
 @common
 @click.pass_obj
@@ -248,7 +252,8 @@ def simulate(session, out, style, scale, fibers, seed, features_only, misaligned
     from . import simulate as simulator
 
     rig = simulator.MISALIGNED if misaligned else simulator.Misalignment()
-    rig = replace(rig, **{name.replace("_off", ""): value for name, value in off.items() if value is not None})
+    names = {"pitch_off": "pitch_parts", "distortion": "k1_per_mm2"}
+    rig = replace(rig, **{names.get(name, name.replace("_off", "")): value for name, value in off.items() if value is not None})
     params = simulator.SimulateParams(style, scale, fibers, seed, misalignment=rig)
     if features_only:
         from .simulate_features import simulate_features
@@ -523,9 +528,9 @@ def overlay(session, capture, strands, output, sweep, angle, position, color, ca
         raise click.UsageError("--sweep and --angle exclude each other")
     photographs, curves = load_capture(capture), load_strands(strands)
     if calibration:
-        from .rig.calibrate import load_errors
+        from .rig.calibrate import calibrated
 
-        photographs = load_errors(calibration).corrected(photographs)
+        photographs = calibrated(calibration, photographs)
     shot = compare.choose_shot(photographs, curves, sweep, angle, position)
     session.report.show(compare.overlay(photographs, curves, shot, output, color))
     session.report.done(output)

@@ -43,10 +43,10 @@ from .rig.calibrate import (
     Calibration,
     RigErrors,
     Solution,
+    calibrated,
     drift,
     gains,
     light,
-    load_errors,
     save_calibration,
     solve,
     turns,
@@ -111,7 +111,7 @@ def reconstruct(
     """
     capture = load_capture(capture_path if scheduler is None else Path(capture_path).resolve())
     if calibration is not None:
-        capture = load_errors(calibration).corrected(capture)
+        capture = calibrated(calibration, capture)
     parameters = resolve(capture, parameters)
     capture = capture.reduced(parameters.ridges.reduce)
     work = work_folder(capture, Path(out), parameters)
@@ -364,7 +364,7 @@ def calibrate(
     """
     capture = load_capture(capture_path if scheduler is None else Path(capture_path).resolve())
     parameters = resolve(capture, replace(parameters, ridges=replace(parameters.ridges, reduce=1)))  # errors are told in whole pixels
-    stated = replace(capture, optics=replace(capture.optics, tilt_deg=0.0, tilt_towards_deg=0.0))
+    stated = replace(capture, optics=capture.optics.ideal())  # features as the photographs show them
     work = work_folder(stated, Path(out), parameters)
     with Cluster(scheduler, [capture.folder], tell) if scheduler else nullcontext() as cluster:
         sweeps = find_features(stated, work, parameters, workers, progress, cluster)

@@ -326,4 +326,8 @@ def test_people_are_told_every_error_and_what_is_none():
     assert "none that is sure" not in rows["working distance"]
     assert rows["step to sweep 1"].startswith("+0.1000 ± 0.0100 °")
     assert rows["gain"].startswith("+2.00 ±")
-    assert len(astuple(FOUND)) == 7
+    assert "pitch" not in rows
+    told = dict(row for row in describe(replace(a_calibration(), errors=replace(FOUND, pitch_parts=0.005, k1_per_mm2=3e-6))) if row)
+    assert told["pitch"].startswith("+0.500 %")
+    assert told["distortion k1"].startswith("+3e-06")
+    assert len(astuple(FOUND)) == 12
