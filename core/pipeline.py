@@ -47,6 +47,7 @@ from .rig.calibrate import (
     drift,
     gains,
     light,
+    load_errors,
     save_calibration,
     solve,
     turns,
@@ -355,21 +356,27 @@ def calibrate(
     progress: Progress = silent,
     scheduler: str | None = None,
     tell: Callable[[str], None] = unheard,
+    start: Path | None = None,
 ) -> Calibration:
     """Find the errors of the rig that took a capture from the capture itself, write them to ``out`` (.json, .toml); returns them.
 
     The photographs are filtered once, on a cluster if there is a ``scheduler``; then curves are grown with the rig as known so far,
-    the rig is solved for, and so on until it stays. Raises CaptureError, StrandscopeError as ``reconstruct`` does, and where too few
+    the rig is solved for, and so on until it stays. What a calibration file ``start`` tells, as from a printed target, is where that begins;
+    what hair does not tell is kept as it has it. Raises CaptureError, StrandscopeError as ``reconstruct`` does, and where too few
     fibers are seen.
     """
     capture = load_capture(capture_path if scheduler is None else Path(capture_path).resolve())
     parameters = resolve(capture, replace(parameters, ridges=replace(parameters.ridges, reduce=1)))  # errors are told in whole pixels
+    begun = RigErrors()
+    if start is not None:
+        calibrated(start, capture)  # raises where it is for another rig
+        begun = load_errors(start)
     stated = replace(capture, optics=capture.optics.ideal())  # features as the photographs show them
     work = work_folder(stated, Path(out), parameters)
     with Cluster(scheduler, [capture.folder], tell) if scheduler else nullcontext() as cluster:
         sweeps = find_features(stated, work, parameters, workers, progress, cluster)
     _check_memory(sweeps, 2 * memory_bytes // 3)  # some are turned and joined anew in each round
-    errors, solution, biased = _solved(capture, sweeps, parameters, workers, progress)
+    errors, solution, biased = _solved(capture, sweeps, parameters, workers, progress, begun)
     told = [gains(np.load(light_path(work, i))) for i in range(len(sweeps))]
     calibration = _summed_up(capture, errors, solution, biased, told)
     save_calibration(out, calibration)
@@ -377,11 +384,11 @@ def calibrate(
 
 
 def _solved(
-    capture: Capture, sweeps: list[SweepFeatures], parameters: Parameters, workers: int, progress: Progress
+    capture: Capture, sweeps: list[SweepFeatures], parameters: Parameters, workers: int, progress: Progress, begun: RigErrors
 ) -> tuple[RigErrors, Solution, np.ndarray]:
     """The errors of the rig by which the sweeps' features agree best, the last step towards them, and how far off each of its
     unknowns may be because the biases of depth from focus are not wholly those that the equations have."""
-    errors, moved_px = RigErrors(), np.inf
+    errors, moved_px = begun, np.inf
     for number, reach_px in enumerate(ROUNDS_PX):
 
         def growing(_stage, done, total, number=number):

@@ -118,11 +118,11 @@ def simulate_target(out: Path, params: TargetParams, target: Target | None = Non
 
 def picture(target: Target, texel_mm: float) -> np.ndarray:
     """The print with its white margin (rows, columns) uint8: 0 where it is black, 255 where it is white. Rows run down."""
-    width, height = (size + 2 * MARGIN_MM for size in target.size_mm)
-    ink = np.zeros((math.ceil(height / texel_mm), math.ceil(width / texel_mm)), np.float32)
-    for left, bottom, right, top in target.black_mm():
-        columns, across = _covered((left + width / 2) / texel_mm, (right + width / 2) / texel_mm)
-        rows, down = _covered((height / 2 - top) / texel_mm, (height / 2 - bottom) / texel_mm)
+    wide, high = (math.ceil((size + 2 * MARGIN_MM) / texel_mm) for size in target.size_mm)
+    ink = np.zeros((high, wide), np.float32)
+    for left, bottom, right, top in target.black_mm() / texel_mm:  # the board's middle is the picture's
+        columns, across = _covered(wide / 2 + left, wide / 2 + right)
+        rows, down = _covered(high / 2 - top, high / 2 - bottom)
         ink[rows, columns] += np.outer(down, across).astype(np.float32)
     return np.rint(255 * (1 - ink)).astype(np.uint8)
 

@@ -10,7 +10,7 @@ from ..errors import StrandscopeError
 
 MISSING = "a printed target needs OpenCV, which is not installed; install it with: pip install 'strandscope[calibrate]'"
 MODULES = 6  # of a marker, its black border included
-LEAST_PEAK = 0.4  # of the best sharpness, down to which photographs tell where a corner is in focus
+LEAST_PEAK = 0.2  # of the best sharpness, down to which photographs tell where a corner is in focus
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,9 @@ class Target:
     marker_mm: float = 3.0
     dictionary: str = "DICT_4X4_100"
 
-    def scaled(self, by: float) -> "Target":
-        """The same, printed ``by`` times as large."""
-        return replace(self, square_mm=by * self.square_mm, marker_mm=by * self.marker_mm)
+    def of_squares(self, square_mm: float) -> "Target":
+        """The same, larger or smaller."""
+        return replace(self, square_mm=square_mm, marker_mm=self.marker_mm * square_mm / self.square_mm)
 
     @property
     def size_mm(self) -> tuple[float, float]:

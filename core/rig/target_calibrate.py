@@ -1,8 +1,8 @@
-"""A capture of a printed target -> what is wrong with the rig that took it, in numbers and in words."""
+"""A capture of a printed target -> what is wrong with the rig that took it."""
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from ..capture import Capture, load_capture
 from ..errors import StrandscopeError
 from ..geometry import Optics
 from ..progress import Progress, silent
-from .calibrate import SURE, RigErrors, write_calibration
+from .calibrate import RigErrors, write_calibration
 from .target import Seen, Target, depth_from_focus, find_corners, measure_corners, opencv
 from .target_fit import FIRST_ANGLE, FOCUS, LEAST_CORNERS, UNKNOWNS, Corners, Fit, Model, appear, begin, optics_of, solve
 
@@ -31,7 +31,7 @@ def look(capture: Capture, target: Target, progress: Progress = silent, workers:
     First markers are read, which tells where the board is; then all corners are looked for where it must have them, blurred ones too.
     Raises StrandscopeError where there are too few.
     """
-    opencv()
+    opencv().setNumThreads(1)  # photographs are what is shared out
     shots = [(k, d, file) for k, sweep in enumerate(capture.sweeps) for d, file in zip(sweep.positions_mm, sweep.files, strict=True)]
     angles = [sweep.angle_deg for sweep in capture.sweeps]
     if table := capture.turntable:
@@ -144,71 +144,44 @@ class TargetCalibration:
 
 def summed_up(found: Fit, model: Model, capture: Capture, target: Target) -> TargetCalibration:
     """What a fit says of the rig."""
-    x, names = found.x, list(UNKNOWNS)
-    optics = optics_of(x, model)
-    spread = dict(zip(names, np.sqrt(np.diag(found.covariance)), strict=False))
-    value = dict(zip(names, x, strict=False))
+    optics, stated, half = optics_of(found.x, model), capture.optics, model.half_mm
+    distance, pitch = stated.working_distance_mm, stated.pitch_mm
 
-    def error_of(function) -> float:
-        """Standard error of a function of the unknowns."""
-        steps = np.sqrt(np.diag(found.covariance)) * 1e-3
-        slope = np.array([(function(x + s * e) - function(x - s * e)) / (2 * s) if s else 0.0 for s, e in zip(steps, np.eye(len(x)), strict=True)])
-        return float(np.sqrt(max(slope @ found.covariance @ slope, 0)))
+    def told(function) -> tuple[float, float]:
+        """A function of the unknowns by name, and its standard error."""
+        spread = np.sqrt(np.diag(found.covariance))
+        step = 1e-3 * spread * np.eye(len(spread))
+        value, *moved = (function(dict(zip(UNKNOWNS, x, strict=False))) for x in (found.x, *(found.x + step), *(found.x - step)))
+        slope = (np.array(moved[: len(step)]) - moved[len(step) :]) / np.maximum(2e-3 * spread, 1e-300)
+        return float(value), float(np.sqrt(max(slope @ found.covariance @ slope, 0)))
 
-    def parts(x):
-        distance, pitch = x[names.index("distance")], x[names.index("pitch")]
-        return (1 + pitch) / (1 + distance) - 1
-
-    def rim(x):
-        """How far outwards the lens puts what belongs to the corner of the image, px."""
-        half = model.half_mm
-        return (
-            geometry.distort(half, 0.0, x[names.index("k1")] / half**2, x[names.index("k2")] / half**4)[0] / model.stated.pitch_mm
-            - half / model.stated.pitch_mm
-        )
-
-    distance = capture.optics.working_distance_mm
-    errors = RigErrors(
-        axis_px=float(value["axis"]),
-        tilt_deg=optics.tilt_deg,
-        tilt_towards_deg=optics.tilt_towards_deg,
-        focus_mm=float(value["focus"]),
-        working_distance_mm=float(distance * value["distance"]),
-        pitch_parts=float(parts(x)),
-        travel_deg=optics.travel_deg,
-        travel_up_deg=optics.travel_up_deg,
-        k1_per_mm2=float(optics.k1_per_mm2),
-        k2_per_mm4=float(optics.k2_per_mm4),
-    )
-    uncertain = RigErrors(
-        axis_px=float(spread["axis"]),
-        tilt_deg=float(np.degrees(spread["tilt"])),
-        tilt_towards_deg=float(np.degrees(spread["tilt_towards"])),
-        focus_mm=float(spread["focus"]),
-        working_distance_mm=float(distance * spread["distance"]),
-        pitch_parts=error_of(parts),
-        travel_deg=float(np.degrees(spread["travel"])),
-        travel_up_deg=float(np.degrees(spread["travel_up"])),
-        k1_per_mm2=float(spread["k1"] / model.half_mm**2),
-        k2_per_mm4=float(spread["k2"] / model.half_mm**4),
-    )
-    stated = capture.optics  # what was stated of lean, travel and distortion was not used in finding them
-    for name in ("tilt_deg", "tilt_towards_deg", "travel_deg", "travel_up_deg", "k1_per_mm2", "k2_per_mm4"):
-        errors = replace(errors, **{name: getattr(errors, name) - getattr(stated, name)})
-    used = np.unique(model.corners.sweep)
-    turned = np.degrees(np.stack([x[FIRST_ANGLE:], np.sqrt(np.diag(found.covariance))[FIRST_ANGLE:]], axis=-1))[used]
-    turns = tuple((float(a), float(t), float(s)) for a, (t, s) in zip(model.corners.angles_deg[used], turned, strict=True))
-    facing, lean, roll = (float(a) for a in np.degrees(x[:3]))
-    hangs = {"facing_deg": facing, "lean_deg": -lean, "roll_deg": roll, "right_mm": float(x[3]), "up_mm": float(x[4]), "before_mm": float(x[5])}
+    rows = {
+        "axis_px": told(lambda a: a["axis"]),
+        "tilt_deg": told(lambda a: np.degrees(a["tilt"]) - stated.tilt_deg),
+        "tilt_towards_deg": told(lambda a: np.degrees(a["tilt_towards"]) - stated.tilt_towards_deg),
+        "focus_mm": told(lambda a: a["focus"]),
+        "working_distance_mm": told(lambda a: distance * a["distance"]),
+        "pitch_parts": told(lambda a: (1 + a["pitch"]) / (1 + a["distance"]) - 1),
+        "travel_deg": told(lambda a: np.degrees(a["travel"]) - stated.travel_deg),
+        "travel_up_deg": told(lambda a: np.degrees(a["travel_up"]) - stated.travel_up_deg),
+        "k1_per_mm2": told(lambda a: a["k1"] / half**2 - stated.k1_per_mm2),
+        "k2_per_mm4": told(lambda a: a["k2"] / half**4 - stated.k2_per_mm4),
+    }
+    errors, uncertain = (RigErrors(**{name: row[i] for name, row in rows.items()}) for i in (0, 1))
+    rim = told(lambda a: (geometry.distort(half, 0.0, a["k1"] / half**2, a["k2"] / half**4)[0] - half) / pitch)
+    turns = _turns(found, model)
+    facing, lean, roll = (float(a) for a in np.degrees(found.x[:3]))
+    right, up, before = (float(a) for a in found.x[3:6])
+    hangs = {"facing_deg": facing, "lean_deg": -lean, "roll_deg": roll, "right_mm": right, "up_mm": up, "before_mm": before}
     return TargetCalibration(
         capture=capture.name,
         stated=stated,
         optics=optics,
         errors=errors,
         uncertain=uncertain,
-        pitch_mm=(float(optics.pitch_mm), float(stated.pitch_mm * spread["pitch"])),
-        distortion_px=(float(rim(x)), error_of(rim)),
-        bowl_mm=(float(value["bowl"]), float(spread["bowl"])),
+        pitch_mm=told(lambda a: pitch * (1 + a["pitch"])),
+        distortion_px=rim,
+        bowl_mm=told(lambda a: a["bowl"]),
         turns_deg=turns,
         board=hangs,
         middle_px=((model.shape[1] - 1) / 2, (model.shape[0] - 1) / 2),
@@ -218,6 +191,15 @@ def summed_up(found: Fit, model: Model, capture: Capture, target: Target) -> Tar
         photographs=sum(len(s.files) for s in capture.sweeps) + (len(capture.turntable.files) if capture.turntable else 0),
         square_mm=target.square_mm,
     )
+
+
+def _turns(found: Fit, model: Model) -> tuple[tuple[float, float, float], ...]:
+    """(stated angle, how much too far, standard error) of each angle, in degrees. That all are too far is how the board hangs: 0 on average."""
+    used = np.unique(model.corners.sweep)
+    middle = np.eye(len(used)) - 1 / len(used)
+    off = middle @ found.x[FIRST_ANGLE:][used]
+    spread = np.sqrt(np.diag(middle @ found.covariance[FIRST_ANGLE:, FIRST_ANGLE:][np.ix_(used, used)] @ middle))
+    return tuple((float(a), float(o), float(s)) for a, o, s in zip(model.corners.angles_deg[used], np.degrees(off), np.degrees(spread), strict=True))
 
 
 def calibrate_by_target(
@@ -245,153 +227,3 @@ def calibrate_by_target(
 def save_target_calibration(path: Path, calibration: TargetCalibration) -> None:
     """Write what a target told as a calibration file that `reconstruct --calibration` reads."""
     write_calibration(path, {"told_by": "target", **asdict(calibration)})
-
-
-# ---- in words --------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Alignment:
-    """How far off the paper's alignments a rig may be before someone should turn a screw. What is below is corrected by numbers."""
-
-    axis_mm: float = 2.0  # from the middle of the image
-    tilt_deg: float = 0.5  # of the axis in the image, and towards the camera
-    travel_deg: float = 0.5  # between the stage and the line of sight
-    focus_mm: float = 1.0
-    distance_parts: float = 0.03
-    pitch_parts: float = 0.03
-    distortion_px: float = 8.0
-    bowl_mm: float = 0.6
-    turn_deg: float = 0.05
-    left_px: float = 0.3
-
-
-def warnings(found: TargetCalibration, allowed: Alignment = Alignment()) -> list[str]:
-    """What should be set right on the rig itself, and which screw does it; empty for one that is well aligned."""
-    optics, stated, told = found.optics, found.stated, []
-
-    def warn(value: float, error: float, most: float, text: str) -> None:
-        if abs(value) > most and abs(value) > SURE * error:
-            told.append(text)
-
-    right_mm = (optics.axis_col_px - found.middle_px[0]) * optics.pitch_mm
-    side, other = ("right", "left") if right_mm > 0 else ("left", "right")
-    warn(
-        right_mm,
-        0.0,
-        allowed.axis_mm,
-        f"the axis is {abs(right_mm):.1f} mm {side} of the middle of the image: move the turntable to the {other} by that, or the camera to the {side}",
-    )
-    way = "clockwise" if optics.tilt_deg > 0 else "counterclockwise"
-    warn(
-        optics.tilt_deg,
-        found.uncertain.tilt_deg,
-        allowed.tilt_deg,
-        f"the axis leans {abs(optics.tilt_deg):.2f}° to the {'right' if optics.tilt_deg > 0 else 'left'} in the image: loosen the camera's collar and turn it {way} by that, seen from behind it, or level the turntable",
-    )
-    way = "down at it: point the lens up" if optics.tilt_towards_deg > 0 else "up at it: point the lens down"
-    warn(
-        optics.tilt_towards_deg,
-        found.uncertain.tilt_towards_deg,
-        allowed.tilt_deg,
-        f"the camera looks {abs(optics.tilt_towards_deg):.2f}° {way} by that (the screw under the camera plate), or level the turntable",
-    )
-    way = "left" if optics.travel_deg > 0 else "right"
-    warn(
-        optics.travel_deg,
-        found.uncertain.travel_deg,
-        allowed.travel_deg,
-        f"the stage leads the camera {abs(optics.travel_deg):.2f}° off its line of sight as it draws back: loosen the camera on the stage and turn the lens to the {way} by that",
-    )
-    way = "down" if optics.travel_up_deg > 0 else "up"
-    warn(
-        optics.travel_up_deg,
-        found.uncertain.travel_up_deg,
-        allowed.travel_deg,
-        f"the stage leads the camera {abs(optics.travel_up_deg):.2f}° {'up' if optics.travel_up_deg > 0 else 'down'} as it draws back: tip the lens {way} by that on the stage, or level the stage",
-    )
-    way = "towards" if found.errors.focus_mm > 0 else "away from"
-    warn(
-        found.errors.focus_mm,
-        found.uncertain.focus_mm,
-        allowed.focus_mm,
-        f"the plane of focus is {abs(found.errors.focus_mm):.2f} mm {'nearer to' if way == 'towards' else 'farther from'} the camera than the stage says: set the stage's zero anew by that, or turn the focus ring back and tape it",
-    )
-    off = optics.working_distance_mm / stated.working_distance_mm - 1
-    warn(
-        off,
-        found.uncertain.working_distance_mm / stated.working_distance_mm,
-        allowed.distance_parts,
-        f"the working distance is {optics.working_distance_mm:.0f} mm, stated {stated.working_distance_mm:.0f}: correct the statement, or turn the focus ring",
-    )
-    off = optics.pitch_mm / stated.pitch_mm - 1
-    warn(
-        off,
-        found.pitch_mm[1] / stated.pitch_mm,
-        allowed.pitch_parts,
-        f"a millimetre is {1 / optics.pitch_mm:.2f} px, stated {1 / stated.pitch_mm:.2f}: correct the statement, or turn the focus ring and set the distance anew",
-    )
-    warn(
-        found.distortion_px[0],
-        found.distortion_px[1],
-        allowed.distortion_px,
-        f"the lens distorts by {abs(found.distortion_px[0]):.1f} px at the corner of the image: it is corrected, but a macro lens should do better",
-    )
-    warn(
-        found.bowl_mm[0],
-        found.bowl_mm[1],
-        allowed.bowl_mm,
-        f"the corners of the image are in focus {abs(found.bowl_mm[0]):.2f} mm {'before' if found.bowl_mm[0] > 0 else 'behind'} its middle, which is not corrected: keep the hair in the middle, or close the aperture",
-    )
-    for angle, turned, error in found.turns_deg:
-        warn(
-            turned,
-            error,
-            allowed.turn_deg,
-            f"the turntable is turned {turned:+.3f}° too far at {angle:g}°: check its degrees per step, its belt and that it always turns the same way",
-        )
-    if found.left_px > allowed.left_px:
-        told.append(f"corners lie {found.left_px:.2f} px off what was found: is the print flat (glued to glass), and did all stand still?")
-    return told
-
-
-def describe(found: TargetCalibration) -> list[tuple[str, str] | None]:
-    """Rows (name, value with its error and meaning) for people; an error that is not sure is said to be none."""
-    errors, uncertain, pitch = found.errors, found.uncertain, found.optics.pitch_mm
-
-    def row(name, value, error, form, unit, meaning):
-        sure = "" if abs(value) >= SURE * error else "; none that is sure"
-        return name, f"{value:+{form}} ± {error:{form}} {unit}  {meaning}{sure}"
-
-    off = 100 * (pitch / found.stated.pitch_mm - 1)
-    turned = np.array(found.turns_deg)
-    return [
-        row("axis", errors.axis_px, uncertain.axis_px, ".3f", "px", f"to the right, {errors.axis_px * pitch:+.4f} mm"),
-        row("tilt", errors.tilt_deg, uncertain.tilt_deg, ".4f", "°", "its upper end to the right"),
-        row("tilt towards", errors.tilt_towards_deg, uncertain.tilt_towards_deg, ".4f", "°", "its upper end towards the camera"),
-        row("focus", errors.focus_mm, uncertain.focus_mm, ".4f", "mm", "towards the camera"),
-        row("working distance", errors.working_distance_mm, uncertain.working_distance_mm, ".2f", "mm", "farther from the lens"),
-        row("pitch", off, 100 * found.pitch_mm[1] / pitch, ".4f", "%", f"wider: {pitch:.7f} mm, {1 / pitch:.4f} px a mm"),
-        row("travel", errors.travel_deg, uncertain.travel_deg, ".4f", "°", "the stage leads to the right"),
-        row("travel up", errors.travel_up_deg, uncertain.travel_up_deg, ".4f", "°", "and upwards"),
-        row(
-            "distortion",
-            *found.distortion_px,
-            ".2f",
-            "px",
-            f"outwards at the corner of the image (k1 {errors.k1_per_mm2:.3g} 1/mm², k2 {errors.k2_per_mm4:.3g} 1/mm⁴)",
-        ),
-        row("bowl", *found.bowl_mm, ".3f", "mm", "the corner of the image is in focus before its middle; not corrected"),
-        ("turntable", f"{turned[:, 1].min():+.4f} … {turned[:, 1].max():+.4f} °, each ± {np.median(turned[:, 2]):.4f}"),
-        (
-            "board",
-            "{facing_deg:+.2f}° turned, leaning {lean_deg:.2f}° back, rolled {roll_deg:+.2f}°, {right_mm:+.2f} mm right of the axis, {before_mm:+.2f} mm before it".format(
-                **found.board
-            ),
-        ),
-        None,
-        (
-            "left over",
-            f"{found.left_px:.3f} px, {1000 * found.left_px * pitch:.1f} µm, in the image, {1000 * found.left_mm:.0f} µm in depth; {found.corners} corners in {found.photographs} photographs",
-        ),
-    ]

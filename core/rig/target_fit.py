@@ -27,9 +27,9 @@ TUKEY = 4.5  # observations this many robust deviations off are not heard
 LEAST_SIGMA_PX, LEAST_SIGMA_MM = 0.005, 0.002
 ANGLE_PRIOR_DEG = 0.2  # the turntable turns as stated, within this
 BLURS = 4  # groups of observations by how much they are blurred; each has a scatter of its own
-FACING_DEG = (-45.0, -20.0, 0.0, 20.0, 45.0)  # how far from facing the camera the board may be, on average, to begin with
+FACING_DEG = (0.0, -25.0, 25.0, -50.0, 50.0)  # how far from facing the camera the board may be, on average, to begin with
 THINNED, ROUGH_ROUNDS, ROUNDS = 1500, 4, 6
-WRONG_WAY_PX = 2.0  # what is left, from which a turntable or a stage that runs the other way is looked for
+WRONG_PX, WRONG_MM = 2.0, 2.0  # what may be left in the image and in depth; from this on the rig is another than was thought
 
 
 class Corners(NamedTuple):
@@ -157,11 +157,17 @@ class Fit:
     left_mm: float  # and in depth
     heard: float  # share of the observations that agree
 
+    @property
+    def wrong(self) -> float:
+        """More than 1 where this is not how the corners were seen: a board that is turned the other way looks alike but for its depths."""
+        return max(self.left_px / WRONG_PX, self.left_mm / WRONG_MM)
+
 
 def fit(model: Model, start: np.ndarray, rounds: int = ROUNDS) -> Fit:
     """Robust least squares: Tukey's biweight, scatter by how blurred a corner is. Corners of an angle stay where they are from photograph
     to photograph, and so does what is wrong with how they are seen: the covariance takes them together."""
     from scipy.optimize import least_squares
+    from threadpoolctl import threadpool_limits
 
     prior = np.r_[list(UNKNOWNS.values()), np.full(len(start) - FIRST_ANGLE, np.radians(ANGLE_PRIOR_DEG))]
     x = np.asarray(start, float)
@@ -177,7 +183,8 @@ def fit(model: Model, start: np.ndarray, rounds: int = ROUNDS) -> Fit:
             off_px, off_mm = misses(x, model)
             return np.concatenate([(off_px * weight_px[:, None]).ravel(), off_mm * weight_mm, x / prior])
 
-        solved = least_squares(residuals, x, x_scale="jac", method="trf", max_nfev=60)
+        with threadpool_limits(1, "blas"):  # the matrices are slim: threads would wait for each other, for seconds on a busy machine
+            solved = least_squares(residuals, x, x_scale="jac", method="trf", max_nfev=20)
         x = solved.x
     off_px, off_mm = misses(x, model)
     left_px = _spread(off_px[blur == 0]) if np.any(blur == 0) else _spread(off_px)
@@ -230,9 +237,9 @@ def begin(model: Model, where: str) -> Fit:
             f"{where}: the target is seen at angles of {angles.min():g}° to {angles.max():g}°; expected {LEAST_SPREAD_DEG:g}° or more between"
         )
     rough = _rough(model)
-    if rough.left_px > WRONG_WAY_PX:
+    if rough.wrong > 1:
         for what, other in (("the turntable turns", _reversed(model)), ("the stage moves", _backwards(model))):
-            if _rough(other).left_px < 0.3 * rough.left_px:
+            if _rough(other).wrong < 0.5:
                 raise StrandscopeError(f"{where}: {what} the other way than the capture says; change its sign where the rig is configured")
     return rough
 
@@ -246,10 +253,10 @@ def solve(model: Model, start: np.ndarray, where: str) -> Fit:
             "sweep on until all of the board has been sharp, in steps of 1 mm or less"
         )
     found = fit(model, start)
-    if found.left_px > WRONG_WAY_PX or found.heard < 0.5:
+    if found.wrong > 1 or found.heard < 0.5:
         raise StrandscopeError(
-            f"{where}: corners lie {found.left_px:.1f} px off any rig that was tried; expected less than {WRONG_WAY_PX:g} px: is the board flat, did it "
-            "stand still while the stage moved, and are angles and positions right?"
+            f"{where}: corners lie {found.left_px:.1f} px and {found.left_mm:.1f} mm in depth off any rig that was tried: is the board "
+            "flat, did it stand still while the stage moved, and are angles and positions right?"
         )
     return found
 
@@ -272,9 +279,9 @@ def _rough(model: Model) -> Fit:
     best = None
     for facing in FACING_DEG:
         tried = fit(thinned, _start(thinned, facing), ROUGH_ROUNDS)
-        if best is None or tried.left_px < best.left_px:
+        if best is None or tried.wrong < best.wrong:
             best = tried
-        if best.left_px < 0.5 * WRONG_WAY_PX:
+        if best.wrong < 0.7:
             break
     return best
 
