@@ -113,6 +113,11 @@ def reconstruct(
     capture = load_capture(capture_path if scheduler is None else Path(capture_path).resolve())
     if calibration is not None:
         capture = calibrated(calibration, capture)
+        if capture.features and scheduler is not None:
+            raise StrandscopeError(
+                f"{capture.folder}: has features in place of photographs, and workers of a cluster read these as they are; "
+                "leave --scheduler away to have them corrected (--calibration)"
+            )
     parameters = resolve(capture, parameters)
     capture = capture.reduced(parameters.ridges.reduce)
     work = work_folder(capture, Path(out), parameters)
@@ -176,7 +181,7 @@ def find_features(
     capture: Capture, work: Path, parameters: Parameters, workers: int, progress: Progress, cluster: Cluster | None = None
 ) -> list[SweepFeatures]:
     """The features of every sweep, filtered from the photographs, here or on a cluster, unless ``work`` has them from a run before, or
-    the capture itself."""
+    the capture itself; these are as a photograph shows them, and are set right for what is known of the rig."""
     missing = [i for i in range(len(capture.sweeps)) if not all(path(work, i).is_file() for path in _PRODUCTS)]
     shape, total = capture.shape, sum(len(capture.sweeps[i].files) for i in missing)
     jobs = (job for i in missing for job in _jobs(capture, i, parameters, shape))
@@ -197,7 +202,8 @@ def find_features(
                     np.save(part, np.stack(pictures))
             save_features(features_path(work, i), pack(sweep.angle_deg, sweep.positions_mm, shape, ridges))
     progress("finding ridges", total, total)
-    return [load_features(features_path(work, i)) for i in range(len(capture.sweeps))]
+    found = [load_features(features_path(work, i)) for i in range(len(capture.sweeps))]
+    return [seen_by(f, s, capture.optics) for f, s in zip(found, capture.sweeps, strict=True)] if capture.features else found
 
 
 def _jobs(capture: Capture, i: int, parameters: Parameters, shape: tuple[int, int]) -> Iterator[tuple]:

@@ -17,6 +17,8 @@ from .target import Seen, Target, depth_from_focus, find_corners, measure_corner
 from .target_fit import FIRST_ANGLE, FOCUS, LEAST_CORNERS, UNKNOWNS, Corners, Fit, Model, appear, begin, optics_of, solve
 
 WINDOW = 0.8  # of the white rim of a marker: what is looked at around a corner, each way
+# what the scatter of corners does not explain, found on simulated boards: depth from focus of a print, edges of squares under distortion
+FLOOR_MM, FLOOR_RIM_PX = 0.003, 0.03
 BLURRED = 0.35  # radius of the blur of corners that are measured, in white rims of a marker
 STOPPED = 5.0  # times as far from the plane of focus, for photographs at a small aperture
 
@@ -147,19 +149,19 @@ def summed_up(found: Fit, model: Model, capture: Capture, target: Target) -> Tar
     optics, stated, half = optics_of(found.x, model), capture.optics, model.half_mm
     distance, pitch = stated.working_distance_mm, stated.pitch_mm
 
-    def told(function) -> tuple[float, float]:
-        """A function of the unknowns by name, and its standard error."""
+    def told(function, floor: float = 0.0) -> tuple[float, float]:
+        """A function of the unknowns by name, and its standard error, ``floor`` at least."""
         spread = np.sqrt(np.diag(found.covariance))
         step = 1e-3 * spread * np.eye(len(spread))
         value, *moved = (function(dict(zip(UNKNOWNS, x, strict=False))) for x in (found.x, *(found.x + step), *(found.x - step)))
         slope = (np.array(moved[: len(step)]) - moved[len(step) :]) / np.maximum(2e-3 * spread, 1e-300)
-        return float(value), float(np.sqrt(max(slope @ found.covariance @ slope, 0)))
+        return float(value), float(np.sqrt(max(slope @ found.covariance @ slope, 0) + floor**2))
 
     rows = {
         "axis_px": told(lambda a: a["axis"]),
         "tilt_deg": told(lambda a: np.degrees(a["tilt"]) - stated.tilt_deg),
         "tilt_towards_deg": told(lambda a: np.degrees(a["tilt_towards"]) - stated.tilt_towards_deg),
-        "focus_mm": told(lambda a: a["focus"]),
+        "focus_mm": told(lambda a: a["focus"], FLOOR_MM),
         "working_distance_mm": told(lambda a: distance * a["distance"]),
         "pitch_parts": told(lambda a: (1 + a["pitch"]) / (1 + a["distance"]) - 1),
         "travel_deg": told(lambda a: np.degrees(a["travel"]) - stated.travel_deg),
@@ -168,7 +170,7 @@ def summed_up(found: Fit, model: Model, capture: Capture, target: Target) -> Tar
         "k2_per_mm4": told(lambda a: a["k2"] / half**4 - stated.k2_per_mm4),
     }
     errors, uncertain = (RigErrors(**{name: row[i] for name, row in rows.items()}) for i in (0, 1))
-    rim = told(lambda a: (geometry.distort(half, 0.0, a["k1"] / half**2, a["k2"] / half**4)[0] - half) / pitch)
+    rim = told(lambda a: (geometry.distort(half, 0.0, a["k1"] / half**2, a["k2"] / half**4)[0] - half) / pitch, FLOOR_RIM_PX)
     turns = _turns(found, model)
     facing, lean, roll = (float(a) for a in np.degrees(found.x[:3]))
     right, up, before = (float(a) for a in found.x[3:6])

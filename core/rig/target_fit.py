@@ -29,6 +29,7 @@ ANGLE_PRIOR_DEG = 0.2  # the turntable turns as stated, within this
 BLURS = 4  # groups of observations by how much they are blurred; each has a scatter of its own
 FACING_DEG = (0.0, -25.0, 25.0, -50.0, 50.0)  # how far from facing the camera the board may be, on average, to begin with
 THINNED, ROUGH_ROUNDS, ROUNDS = 1500, 4, 6
+DOUBTED = 0.15  # from this share of what follows on, a turntable or a stage that goes the other way is thought of
 WRONG_PX, WRONG_MM = 2.0, 2.0  # what may be left in the image and in depth; from this on the rig is another than was thought
 
 
@@ -162,6 +163,11 @@ class Fit:
         """More than 1 where this is not how the corners were seen: a board that is turned the other way looks alike but for its depths."""
         return max(self.left_px / WRONG_PX, self.left_mm / WRONG_MM)
 
+    @property
+    def doubt(self) -> float:
+        """The same, more by the image: what moves away instead of nearer is seen there, by little."""
+        return 4 * self.left_px / WRONG_PX + self.left_mm / WRONG_MM
+
 
 def fit(model: Model, start: np.ndarray, rounds: int = ROUNDS) -> Fit:
     """Robust least squares: Tukey's biweight, scatter by how blurred a corner is. Corners of an angle stay where they are from photograph
@@ -237,10 +243,12 @@ def begin(model: Model, where: str) -> Fit:
             f"{where}: the target is seen at angles of {angles.min():g}° to {angles.max():g}°; expected {LEAST_SPREAD_DEG:g}° or more between"
         )
     rough = _rough(model)
-    if rough.wrong > 1:
-        for what, other in (("the turntable turns", _reversed(model)), ("the stage moves", _backwards(model))):
-            if _rough(other).wrong < 0.5:
-                raise StrandscopeError(f"{where}: {what} the other way than the capture says; change its sign where the rig is configured")
+    if rough.wrong > DOUBTED:
+        others = {"the turntable turns": _rough(_turned(model)), "the stage moves": _rough(_backwards(model))}
+        others["turntable and stage both go"] = _rough(_turned(_backwards(model)))
+        best = min(others, key=lambda what: others[what].doubt)
+        if others[best].doubt < 0.4 * rough.doubt:
+            raise StrandscopeError(f"{where}: {best} the other way than the capture says; change the sign where the rig is configured")
     return rough
 
 
@@ -261,7 +269,7 @@ def solve(model: Model, start: np.ndarray, where: str) -> Fit:
     return found
 
 
-def _reversed(model: Model) -> Model:
+def _turned(model: Model) -> Model:
     return model._replace(corners=model.corners._replace(angles_deg=-model.corners.angles_deg))
 
 

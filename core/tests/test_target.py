@@ -4,7 +4,7 @@ import importlib.util
 import json
 import re
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +12,18 @@ import pytest
 
 from strandscope.core.capture import load_capture
 from strandscope.core.cli import run
+from strandscope.core.compare import load_truth, score
 from strandscope.core.errors import StrandscopeError
 from strandscope.core.geometry import Optics
-from strandscope.core.rig.calibrate import RigErrors, calibrated, load_errors
+from strandscope.core.pipeline import preset, reconstruct
+from strandscope.core.rig.calibrate import RigErrors, calibrated, load_errors, write_calibration
 from strandscope.core.rig.target import Target, depth_from_focus, find_corners, measure_corners
 from strandscope.core.rig.target_calibrate import calibrate_by_target, summed_up
 from strandscope.core.rig.target_fit import FIRST_ANGLE, UNKNOWNS, Corners, Model, appear, begin, optics_of, rotation, solve
 from strandscope.core.rig.target_pdf import print_target
 from strandscope.core.rig.target_words import describe, warnings
-from strandscope.core.simulate import Misalignment
+from strandscope.core.simulate import Misalignment, SimulateParams
+from strandscope.core.simulate_features import simulate_features
 from strandscope.core.simulate_target import Mounting, TargetParams, photograph, picture, plan, simulate_target
 
 needs_opencv = pytest.mark.skipif(importlib.util.find_spec("cv2") is None, reason="needs OpenCV (the extra `calibrate`)")
@@ -325,6 +328,27 @@ def test_the_file_corrects_a_capture_that_states_the_same(told, board):
     with pytest.raises(StrandscopeError, match="captured with the calibration already"):
         calibrated(path, right)
     assert json.loads(path.read_text())["told_by"] == "target"
+
+
+def test_a_capture_that_is_corrected_scores_as_one_of_an_aligned_rig(tmp_path):
+    """Hair seen by a rig that is off in all ways, with 2.5 px of distortion at the corner of its small image."""
+    wrong = replace(WRONG, tilt_towards_deg=0.3, k1_per_mm2=5e-4)
+    size = SimulateParams(style="wavy", scale="tiny", fibers=8, seed=3)
+    aligned = simulate_features(tmp_path / "aligned", size)
+    crooked = simulate_features(tmp_path / "crooked", replace(size, misalignment=wrong))
+    found = replace(wrong.errors(crooked), angles_deg=(), gains=())
+    write_calibration(tmp_path / "rig.json", {"errors": asdict(found), "stated": asdict(crooked.optics)})
+    params = replace(preset(), infill=None)
+    runs = {"aligned": (aligned, None), "left": (crooked, None), "corrected": (crooked, tmp_path / "rig.json")}
+    told = {}
+    for name, (capture, calibration) in runs.items():
+        strands = reconstruct(capture.folder, tmp_path / f"{name}.npz", params, calibration=calibration)
+        told[name] = score(strands, load_truth(capture.truth_path))
+    assert told["corrected"]["recall"] > told["aligned"]["recall"] - 0.02
+    assert told["corrected"]["precision"] > told["aligned"]["precision"] - 0.01
+    assert told["corrected"]["pos_err_um"]["mean"] < 1.3 * told["aligned"]["pos_err_um"]["mean"]
+    assert told["left"]["recall"] < told["aligned"]["recall"] - 0.1
+    assert told["left"]["pos_err_um"]["mean"] > 3 * told["aligned"]["pos_err_um"]["mean"]
 
 
 def test_the_command_line_tells_and_warns(board, tmp_path, capsys):
