@@ -28,7 +28,7 @@ LEAST_SIGMA_PX, LEAST_SIGMA_MM = 0.005, 0.002
 ANGLE_PRIOR_DEG = 0.2  # the turntable turns as stated, within this
 BLURS = 4  # groups of observations by how much they are blurred; each has a scatter of its own
 FACING_DEG = (0.0, -25.0, 25.0, -50.0, 50.0)  # how far from facing the camera the board may be, on average, to begin with
-THINNED, ROUGH_ROUNDS, ROUNDS = 1500, 4, 6
+THINNED, ROUGH_ROUNDS, ROUNDS = 600, 4, 6
 DOUBTED = 0.15  # from this share of what follows on, a turntable or a stage that goes the other way is thought of
 WRONG_PX, WRONG_MM = 2.0, 2.0  # what may be left in the image and in depth; from this on the rig is another than was thought
 
@@ -169,7 +169,7 @@ class Fit:
         return 4 * self.left_px / WRONG_PX + self.left_mm / WRONG_MM
 
 
-def fit(model: Model, start: np.ndarray, rounds: int = ROUNDS) -> Fit:
+def fit(model: Model, start: np.ndarray, rounds: int = ROUNDS, steps: int = 20) -> Fit:
     """Robust least squares: Tukey's biweight, scatter by how blurred a corner is. Corners of an angle stay where they are from photograph
     to photograph, and so does what is wrong with how they are seen: the covariance takes them together."""
     from scipy.optimize import least_squares
@@ -190,7 +190,7 @@ def fit(model: Model, start: np.ndarray, rounds: int = ROUNDS) -> Fit:
             return np.concatenate([(off_px * weight_px[:, None]).ravel(), off_mm * weight_mm, x / prior])
 
         with threadpool_limits(1, "blas"):  # the matrices are slim: threads would wait for each other, for seconds on a busy machine
-            solved = least_squares(residuals, x, x_scale="jac", method="trf", max_nfev=20)
+            solved = least_squares(residuals, x, x_scale="jac", method="trf", max_nfev=steps)
         x = solved.x
     off_px, off_mm = misses(x, model)
     left_px = _spread(off_px[blur == 0]) if np.any(blur == 0) else _spread(off_px)
@@ -286,7 +286,7 @@ def _rough(model: Model) -> Fit:
     thinned = model._replace(corners=seen._replace(**chosen))
     best = None
     for facing in FACING_DEG:
-        tried = fit(thinned, _start(thinned, facing), ROUGH_ROUNDS)
+        tried = fit(thinned, _start(thinned, facing), ROUGH_ROUNDS, steps=10)
         if best is None or tried.wrong < best.wrong:
             best = tried
         if best.wrong < 0.7:
