@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .capture import Capture, features_path, load_capture
+from .capture import Capture, Sweep, features_path, load_capture
 from .cluster import Cluster, Hands, unheard
 from .confidence import confidence, expected_error
 from .crew import Threads
@@ -203,7 +203,15 @@ def find_features(
             save_features(features_path(work, i), pack(sweep.angle_deg, sweep.positions_mm, shape, ridges))
     progress("finding ridges", total, total)
     found = [load_features(features_path(work, i)) for i in range(len(capture.sweeps))]
-    return [seen_by(f, s, capture.optics) for f, s in zip(found, capture.sweeps, strict=True)] if capture.features else found
+    if not capture.features:
+        return found
+    return [f if _as_stored(f, s, capture.optics) else seen_by(f, s, capture.optics) for f, s in zip(found, capture.sweeps, strict=True)]
+
+
+def _as_stored(features: SweepFeatures, sweep: Sweep, optics: Optics) -> bool:
+    """Whether nothing is known of the rig that the stored features of a sweep do not have already."""
+    same = np.allclose(np.sort(sweep.positions_mm), features.positions_mm, rtol=0, atol=1e-6) and abs(sweep.angle_deg - features.angle_deg) < 1e-9
+    return same and optics == optics.ideal()
 
 
 def _jobs(capture: Capture, i: int, parameters: Parameters, shape: tuple[int, int]) -> Iterator[tuple]:
