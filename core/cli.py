@@ -230,6 +230,10 @@ def main_group():
 @click.option("--working-distance-off-mm", type=float, metavar="MM", help="The plane of focus is farther from the lens.  [misaligned: 2]")
 @click.option("--turntable-step-off-deg", type=float, metavar="DEG", help="One step, in the middle, turns too far.  [misaligned: 0.1]")
 @click.option("--every-step-off-deg", type=float, metavar="DEG", help="Every step turns too far.  [misaligned: 0]")
+@click.option("--pitch-off", type=float, metavar="PARTS", help="A pixel is wider on the plane of focus.  [misaligned: 0]")
+@click.option("--travel-deg", type=float, metavar="DEG", help="The stage leads the camera to the right of its line of sight.  [misaligned: 0]")
+@click.option("--travel-up-deg", type=float, metavar="DEG", help="And upwards.  [misaligned: 0]")
+@click.option("--distortion", type=float, metavar="K1", help="The lens distorts: k1, in 1/mm².  [misaligned: 0]")
 @click.option("--gain-drift", type=float, metavar="PARTS", help="Photographs gain light from the first to the last of a sweep.  [misaligned: 0.05]")
 @common
 @click.pass_obj
@@ -248,7 +252,8 @@ def simulate(session, out, style, scale, fibers, seed, features_only, misaligned
     from . import simulate as simulator
 
     rig = simulator.MISALIGNED if misaligned else simulator.Misalignment()
-    rig = replace(rig, **{name.replace("_off", ""): value for name, value in off.items() if value is not None})
+    names = {"pitch_off": "pitch_parts", "distortion": "k1_per_mm2"}
+    rig = replace(rig, **{names.get(name, name.replace("_off", "")): value for name, value in off.items() if value is not None})
     params = simulator.SimulateParams(style, scale, fibers, seed, misalignment=rig)
     if features_only:
         from .simulate_features import simulate_features
@@ -589,34 +594,68 @@ def batch(session, captures, folder, listed, json_file, preset, params, method, 
         raise StrandscopeError(f"{failed} of {len(outcomes)} captures failed")
 
 
-@main_group.command(short_help="Find what is wrong with the rig, from a capture.")
-@click.argument("capture", type=PATH)
-@click.option("--from-features", is_flag=True, required=True, expose_value=False, help="From the hair itself: fibers must coincide across angles.")
-@click.option("-o", "--output", type=PATH, required=True, help="The calibration file to write (.json, .toml).")
+@main_group.command(short_help="Find what is wrong with the rig, from a printed target or from hair.")
+@click.argument("capture", type=PATH, required=False)
+@click.option("--target", is_flag=True, help="From a printed target: CAPTURE has photographs of it, at some angles and positions.")
+@click.option("--from-features", is_flag=True, help="From the hair itself: fibers must coincide across angles.")
+@click.option("-o", "--output", type=PATH, help="The calibration file to write (.json, .toml).")
+@click.option("--print-target", type=PATH, metavar="OUT.pdf", help="Write the target to print, with rulers to check the print, and do nothing else.")
+@click.option("--square-mm", type=POSITIVE, default=5.0, show_default=True, help="Width of a square of the target: for other fields of view.")
+@click.option("--ruler-mm", type=POSITIVE, default=100.0, show_default=True, help="How long the target's ruler of 100 mm is as it was printed.")
+@click.option("--start", type=PATH, metavar="RIG.json", help="With --from-features: begin with this calibration, as one from a target.")
 @click.option("--params", type=PATH, help="A TOML file with settings of the filter and of growing.")
 @click.option("--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given.")
 @click.option("--memory", type=Memory(), default="6GB", show_default=True, help="Memory to use at most; a capture that needs more is refused.")
 @click.option("--scheduler", metavar="tcp://HOST:PORT", help="Find the ridges on the Dask cluster of this scheduler.")
 @common
 @click.pass_obj
-def calibrate(session, capture, output, params, workers, memory, scheduler):
+def calibrate(session, capture, target, from_features, output, print_target, square_mm, ruler_mm, start, params, workers, memory, scheduler):
     """Find by how much the rig that took CAPTURE is not as its capture.json says.
 
-    Looks for the place and the tilt of the turntable's axis, the focus, the working distance, the angle of each sweep, and the
-    gain of the photographs. Each is told with its standard error. Hand the file to `reconstruct --calibration`; the
-    capture itself is not changed.
+    A printed target tells the pitch, the working distance, the place and the tilt of the turntable's axis, the focus, the direction of
+    the stage, and the lens's distortion. Hair tells the axis, the tilt, the focus, the angle of each sweep and the gain of the
+    photographs, and the working distance roughly. Each is told with its standard error. Hand the file to `reconstruct --calibration`;
+    the capture itself is not changed. docs/calibration.md says how to print, mount and photograph the target.
 
     \b
     Example:
-      strandscope calibrate lock --from-features -o out/rig.json
-      strandscope reconstruct lock --calibration out/rig.json -o out/strands.npz
+      strandscope calibrate --print-target target.pdf
+      strandscope calibrate board --target -o out/rig.json
+      strandscope calibrate lock --from-features --start out/rig.json -o out/lock.json
+      strandscope reconstruct lock --calibration out/lock.json -o out/strands.npz
     """
+    if print_target:
+        if capture or target or from_features or output:
+            raise click.UsageError("--print-target stands alone: it writes a PDF")
+        from .rig import target as boards
+        from .rig import target_pdf
+
+        target_pdf.print_target(print_target, boards.Target().of_squares(square_mm))
+        session.report.done(print_target)
+        return
+    if target == from_features:
+        raise click.UsageError("expected one of --target and --from-features")
+    if capture is None or output is None:
+        raise click.UsageError("expected a CAPTURE, and -o with the file to write")
+    if target:
+        from .rig import target as boards
+        from .rig import target_calibrate, target_words
+
+        if start or params or scheduler:
+            raise click.UsageError("--start, --params and --scheduler go with --from-features")
+        board = boards.Target().of_squares(square_mm * ruler_mm / 100)
+        told = target_calibrate.calibrate_by_target(capture, output, board, progress=session.report, workers=workers)
+        session.report.show(terminal.table(target_words.describe(told)))
+        for warning in target_words.warnings(told):
+            session.report.note(warning)
+        session.report.done(output)
+        return
     from . import pipeline
     from .rig.calibrate import describe
 
     parameters = pipeline.read_toml(params) if params else pipeline.preset()
     limits = {"workers": workers, "memory_bytes": memory, "progress": session.report, "scheduler": scheduler, "tell": session.report.note}
-    found = pipeline.calibrate(capture, output, parameters, **limits)
+    found = pipeline.calibrate(capture, output, parameters, start=start, **limits)
     session.report.show(terminal.table(describe(found)))
     session.report.done(output)
 
@@ -656,9 +695,9 @@ def overlay(session, capture, strands, output, sweep, angle, position, color, ca
         raise click.UsageError("--sweep and --angle exclude each other")
     photographs, curves = load_capture(capture), load_strands(strands)
     if calibration:
-        from .rig.calibrate import load_errors
+        from .rig.calibrate import calibrated
 
-        photographs = load_errors(calibration).corrected(photographs)
+        photographs = calibrated(calibration, photographs)
     shot = compare.choose_shot(photographs, curves, sweep, angle, position)
     session.report.show(compare.overlay(photographs, curves, shot, output, color))
     session.report.done(output)

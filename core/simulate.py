@@ -73,6 +73,11 @@ class Misalignment:
     turntable_step_deg: float = 0.0  # the step in the middle turns this much too far, once: all later sweeps are off
     every_step_deg: float = 0.0  # every step turns this much too far
     gain_drift: float = 0.0  # in each sweep the photographs gain this much light from the first to the last, in parts
+    pitch_parts: float = 0.0
+    travel_deg: float = 0.0
+    travel_up_deg: float = 0.0
+    k1_per_mm2: float = 0.0
+    k2_per_mm4: float = 0.0
 
     def errors(self, capture: Capture) -> RigErrors:
         """The same for the sweeps of a capture."""
@@ -80,7 +85,8 @@ class Misalignment:
         angles = self.every_step_deg * k + self.turntable_step_deg * (k >= len(k) // 2)
         gains = tuple(tuple(1 + self.gain_drift * np.linspace(-0.5, 0.5, len(sweep.files))) for sweep in capture.sweeps)
         rig = (self.axis_px, self.tilt_deg, self.tilt_towards_deg, self.focus_mm, self.working_distance_mm)
-        return RigErrors(*rig, tuple(float(a) for a in angles), gains)
+        lens = (self.pitch_parts, self.travel_deg, self.travel_up_deg, self.k1_per_mm2, self.k2_per_mm4)
+        return RigErrors(*rig, tuple(float(a) for a in angles), gains, *lens)
 
 
 # A rig that was set up with care and never checked.
@@ -364,6 +370,21 @@ def drawing(hair: Hair, angle_deg: float, shaded: Shade | None = None, optics: O
     thick = 4 * hair.radius_mm.max()
     span = np.array([where[:, 2].min() - thick, where[:, 2].max() + thick], np.float32)
     return Drawing(ends, hair.fiber[order], colors, span)
+
+
+def as_photographed(drawn: Drawing, optics: Optics, focus_mm: float, shape: tuple[int, int]) -> Drawing:
+    """What is drawn as a photograph of ``shape`` (rows, columns) at d = focus_mm has it, where the lens distorts and the stage leads the
+    camera off its line of sight. A point moves along the plane of its depth, so that the middle of its blur is where it belongs."""
+    if not optics.displaces:
+        return drawn
+    ends = drawn.ends.astype(np.float64)
+    right, up = geometry.travelled(optics, focus_mm)
+    left_mm, top_mm = (optics.axis_col_px - (shape[1] - 1) / 2) * optics.pitch_mm, (optics.axis_row_px - (shape[0] - 1) / 2) * optics.pitch_mm
+    for u, v, w in (ends.T[:3], ends.T[3:6]):
+        scale = optics.working_distance_mm / (optics.working_distance_mm + focus_mm - w)
+        x, y = geometry.distort(left_mm + (u - right) * scale, top_mm - (v - up) * scale, optics.k1_per_mm2, optics.k2_per_mm4)
+        u[:], v[:] = (x - left_mm) / scale, (top_mm - y) / scale
+    return replace(drawn, ends=ends.astype(np.float32))
 
 
 def photograph(hair: Drawing, background: np.ndarray, optics: Optics, focus_mm: float, through: Lens) -> np.ndarray:
@@ -686,6 +707,8 @@ def begin(out: Path, params: SimulateParams, more: dict | None = None) -> bool:
         if not journal.is_file():
             raise StrandscopeError(f"{out}: holds files that no simulation made; expected a new or empty folder for the capture")
         found = json.loads(journal.read_text(encoding="utf-8"))
+        if isinstance(found, dict) and isinstance(found.get("misalignment"), dict):  # one made before there were as many errors
+            found["misalignment"] = asdict(Misalignment()) | found["misalignment"]
     except OSError as error:
         raise explain(error, out) from error
     except ValueError as error:
@@ -721,7 +744,8 @@ class Studio:
         """The mosaic (2 rows, 2 columns) uint16 that the camera takes at a focus and an aperture; ``brighter`` is its gain."""
         through = replace(self.optics, aperture_cone_deg=stopped_cone_deg(self.params, f_number))
         disc = lens(lens_count(through, self.reach_mm + abs(focus_mm)), aperture_radius_mm(through), len(self.background[0]) + 1, rng)
-        planes = photograph(drawn, self.background, through, focus_mm, disc)
+        seen = as_photographed(drawn, through, focus_mm, self.background.shape[1:])
+        planes = photograph(seen, self.background, through, focus_mm, disc)
         return expose(planes * np.float32(brighter), self.params.full_well_e, self.params.read_noise_e, rng)
 
 
