@@ -7,7 +7,7 @@ from collections import Counter
 import pytest
 
 from strandscope.core import rig_faults
-from strandscope.core.rig import session
+from strandscope.core.rig import logbook, session
 from strandscope.core.rig.controller import ControllerConfig, stage_config, start_controller
 from strandscope.core.rig.session import SessionParams
 from strandscope.core.rig.stage import Stage
@@ -95,7 +95,7 @@ def test_what_is_wrong_with_a_capture_is_seen(whole, tmp_path, damage):
 def test_photographs_under_each_others_names_are_told_by_what_they_show(whole, tmp_path):
     """Even where the logbook agrees with the files."""
     folder = copied(whole, tmp_path)
-    records, _ = session.logbook.read((folder / session.LOGBOOK).read_bytes())
+    records, _ = logbook.read((folder / session.LOGBOOK).read_bytes())
     safe = {record["file"]: record for record in records if record["what"] == "safe"}
     one, two = "sweep_000/img_0001.dng", "sweep_000/img_0002.dng"
     (folder / session.LOGBOOK).unlink()

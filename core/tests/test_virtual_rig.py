@@ -17,7 +17,7 @@ from strandscope.core.capture import load_capture
 from strandscope.core.cli import run as strandscope
 from strandscope.core.errors import StrandscopeError
 from strandscope.core.raw import read_header, read_planes
-from strandscope.core.rig import attach, operate, session
+from strandscope.core.rig import attach, logbook, operate, session
 from strandscope.core.rig.camera import CableConfig, CameraSettings, cable_camera, settings_of
 from strandscope.core.rig.controller import ControllerConfig, stage_config, start_controller
 from strandscope.core.rig.operate import CameraConfig, Rig, load_rig, save_rig
@@ -218,7 +218,7 @@ def test_ctrl_c_ends_a_capture_after_its_photograph_and_the_same_command_goes_on
     _, said = first.communicate(timeout=30)
     assert first.returncode == 130
     assert "goes on" in said
-    before = session.replay(session.logbook.read((folder / session.LOGBOOK).read_bytes())[0]).safe
+    before = session.replay(logbook.read((folder / session.LOGBOOK).read_bytes())[0]).safe
     assert len(before) >= 3
     second = program("-o", folder, "--speed", 60, "--progress", "json")
     until(folder, lambda told: told["running"] and told["done"] > len(before), second)
@@ -233,5 +233,5 @@ def test_ctrl_c_ends_a_capture_after_its_photograph_and_the_same_command_goes_on
     assert {"progress", "capture", "note"} <= {event["event"] for event in events}
     assert [e["state"] for e in events if e["event"] == "capture"][-1] == "stopped"
     for record in before.values():  # nothing was taken again
-        assert session.replay(session.logbook.read((folder / session.LOGBOOK).read_bytes())[0]).safe[attach.key_of(record)] == record
+        assert session.replay(logbook.read((folder / session.LOGBOOK).read_bytes())[0]).safe[attach.key_of(record)] == record
         assert read_planes(folder / record["file"]).shape == (1, 180, 150)
