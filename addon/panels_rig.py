@@ -39,7 +39,12 @@ def _split(layout):
 def _alert(layout, context, words: str, icon: str = "ERROR") -> None:
     box = layout.box()
     box.alert = True
-    text(box, context, words, icon=icon)
+    text(box, context, _sentence(words), icon=icon)
+
+
+def _sentence(words: str) -> str:
+    """With a capital, where it does not begin with a name of a file or a port."""
+    return words[:1].upper() + words[1:] if words.split(" ")[0].isalpha() else words
 
 
 def _warnings(layout, context, warnings: list[str]) -> None:
@@ -49,7 +54,7 @@ def _warnings(layout, context, warnings: list[str]) -> None:
     box = layout.box()
     column = box.column()
     for line in reversed(warnings[-SHOWN:]):
-        text(column, context, line[:1].upper() + line[1:], icon="ERROR")
+        text(column, context, _sentence(line), icon="ERROR")
     if len(warnings) > SHOWN:
         text(column, context, f"and {len(warnings) - SHOWN} before", icon="BLANK1")
 
@@ -234,9 +239,10 @@ class STRANDSCOPE_PT_photographs(_Below, bpy.types.Panel):
         failed = run is not None and not run.running and state not in ("done", "stopped")
         head = layout.row(align=True)
         if run and not run.running:
-            head.alert = failed
+            label = head.row()
+            label.alert = failed
             icon = {"done": "CHECKMARK", "stopped": "SNAP_FACE"}.get(state, "ERROR")
-            head.label(text=RUNS.get(state, "Ended in the middle"), icon=icon)
+            label.label(text=RUNS.get(state, "Ended in the middle"), icon=icon)
             head.operator("strandscope.rig_dismiss", text="", icon="X", emboss=False)
         else:
             head.progress(factor=done / total if total else 0.0, type="BAR", text=f"{done} of {total}" if total else f"{RUNS[state]} …")
