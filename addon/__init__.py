@@ -4,9 +4,9 @@ _commands = []  # what `blender --command strandscope` runs, between register an
 
 
 def _modules():
-    from . import operators, panels, props
+    from . import operators, panels, panels_rig, pictures, props
 
-    return props, operators, panels
+    return props, pictures, operators, panels, panels_rig
 
 
 def register():

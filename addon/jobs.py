@@ -203,7 +203,7 @@ class JobOperator:
             return {"RUNNING_MODAL"} if event.type == "ESC" else {"PASS_THROUGH"}
         result = self._job.poll()
         state.show(self._job.stage, self._job.fraction, self._job.remaining_s, self._job.stopping)
-        _redraw(context)
+        redraw(context)
         if result is None:
             return {"PASS_THROUGH"}
         self._release(context)
@@ -218,7 +218,7 @@ class JobOperator:
     def _release(self, context):
         context.window_manager.event_timer_remove(self._timer)
         context.window_manager.strandscope_job.end()
-        _redraw(context)
+        redraw(context)
 
     def _end(self, context, result: Result):
         if result.output is None:
@@ -232,7 +232,8 @@ class JobOperator:
         return {"FINISHED"}
 
 
-def _redraw(context) -> None:
+def redraw(context) -> None:
+    """Have the 3D viewports drawn again, sidebars included."""
     for window in context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":

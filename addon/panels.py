@@ -4,18 +4,20 @@ import textwrap
 
 import bpy
 
-from . import hair
+from . import hair, rig
 
 _CHARACTERS = 0.14  # of text that fit in a pixel of width, at a scale of the interface of 1
 
 
-class _Tab:
+class Tab:
+    """Where the panels are."""
+
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "Strandscope"
 
 
-def _text(layout, context, text: str, icon: str = "NONE") -> None:
+def text(layout, context, text: str, icon: str = "NONE") -> None:
     """Lines of text, wrapped to the width of the sidebar."""
     scale = context.preferences.system.ui_scale
     width = max(int(_CHARACTERS * context.region.width / scale) - 4, 16)
@@ -38,7 +40,7 @@ def _job(layout, context) -> None:
         column.label(text=job.remaining, icon="TIME")
 
 
-class STRANDSCOPE_PT_capture(_Tab, bpy.types.Panel):
+class STRANDSCOPE_PT_capture(Tab, bpy.types.Panel):
     bl_label = "Capture"
 
     def draw(self, context):
@@ -47,16 +49,16 @@ class STRANDSCOPE_PT_capture(_Tab, bpy.types.Panel):
         if settings.capture_error:
             box = layout.box()
             box.alert = True
-            _text(box, context, settings.capture_error, icon="ERROR")
+            text(box, context, settings.capture_error, icon="ERROR")
         elif settings.capture_name:
             column = layout.column()
-            _text(column, context, settings.capture_name, icon="OUTLINER_OB_CURVES")
-            _text(column, context, settings.capture_facts, icon="BLANK1")
-        else:
+            text(column, context, settings.capture_name, icon="OUTLINER_OB_CURVES")
+            text(column, context, settings.capture_facts, icon="BLANK1")
+        elif not rig.desk.running:
             layout.operator("strandscope.import_capture", icon="IMPORT")
 
 
-class STRANDSCOPE_PT_reconstruct(_Tab, bpy.types.Panel):
+class STRANDSCOPE_PT_reconstruct(Tab, bpy.types.Panel):
     bl_label = "Reconstruct"
 
     def draw(self, context):
@@ -74,7 +76,7 @@ class STRANDSCOPE_PT_reconstruct(_Tab, bpy.types.Panel):
             layout.operator("strandscope.reconstruct", icon="STRANDS")
 
 
-class STRANDSCOPE_PT_hair(_Tab, bpy.types.Panel):
+class STRANDSCOPE_PT_hair(Tab, bpy.types.Panel):
     bl_label = "Hair"
 
     def draw(self, context):
@@ -82,7 +84,7 @@ class STRANDSCOPE_PT_hair(_Tab, bpy.types.Panel):
         layout.operator("strandscope.import_strands", icon="IMPORT")
         if not hair.is_hair(active):
             return
-        _text(layout, context, hair.describe(active), icon="OUTLINER_OB_CURVES")
+        text(layout, context, hair.describe(active), icon="OUTLINER_OB_CURVES")
         inputs = hair.switches(active)
         if inputs:
             row = layout.row(align=True)
@@ -90,11 +92,11 @@ class STRANDSCOPE_PT_hair(_Tab, bpy.types.Panel):
                 row.prop(switch, "value", text=name, toggle=True)
         if context.scene.render.engine == "CYCLES" and hair.is_small_for_cycles(active):
             column = layout.column(align=True)
-            _text(column, context, "Too thin for Cycles at this scale", icon="INFO")
+            text(column, context, "Too thin for Cycles at this scale", icon="INFO")
             column.operator("strandscope.enlarge", icon="FULLSCREEN_ENTER")
 
 
-class STRANDSCOPE_PT_compare(_Tab, bpy.types.Panel):
+class STRANDSCOPE_PT_compare(Tab, bpy.types.Panel):
     bl_label = "Compare"
 
     def draw(self, context):

@@ -10,7 +10,7 @@ import re
 import sys
 import traceback
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import click
@@ -230,6 +230,10 @@ def main_group():
 @click.option("--working-distance-off-mm", type=float, metavar="MM", help="The plane of focus is farther from the lens.  [misaligned: 2]")
 @click.option("--turntable-step-off-deg", type=float, metavar="DEG", help="One step, in the middle, turns too far.  [misaligned: 0.1]")
 @click.option("--every-step-off-deg", type=float, metavar="DEG", help="Every step turns too far.  [misaligned: 0]")
+@click.option("--pitch-off", type=float, metavar="PARTS", help="A pixel is wider on the plane of focus.  [misaligned: 0]")
+@click.option("--travel-deg", type=float, metavar="DEG", help="The stage leads the camera to the right of its line of sight.  [misaligned: 0]")
+@click.option("--travel-up-deg", type=float, metavar="DEG", help="And upwards.  [misaligned: 0]")
+@click.option("--distortion", type=float, metavar="K1", help="The lens distorts: k1, in 1/mm².  [misaligned: 0]")
 @click.option("--gain-drift", type=float, metavar="PARTS", help="Photographs gain light from the first to the last of a sweep.  [misaligned: 0.05]")
 @common
 @click.pass_obj
@@ -248,7 +252,8 @@ def simulate(session, out, style, scale, fibers, seed, features_only, misaligned
     from . import simulate as simulator
 
     rig = simulator.MISALIGNED if misaligned else simulator.Misalignment()
-    rig = replace(rig, **{name.replace("_off", ""): value for name, value in off.items() if value is not None})
+    names = {"pitch_off": "pitch_parts", "distortion": "k1_per_mm2"}
+    rig = replace(rig, **{names.get(name, name.replace("_off", "")): value for name, value in off.items() if value is not None})
     params = simulator.SimulateParams(style, scale, fibers, seed, misalignment=rig)
     if features_only:
         from .simulate_features import simulate_features
@@ -394,6 +399,139 @@ def _parameters(preset, params, method, infill, no_infill):
     return parameters if infill is None else replace(parameters, infill=replace(parameters.infill or pipeline.InfillParams(), count=infill))
 
 
+@main_group.command(short_help="Photograph hair with a rig: hours, survived.")
+@click.argument("plan", type=PATH, required=False, metavar="[PLAN.toml]")
+@click.option("-o", "--output", "folder", type=PATH, metavar="CAPTURE", help="The capture to make, or to go on with: a folder.")
+@click.option("--virtual", is_flag=True, help="With a simulated controller, camera and lock of hair.")
+@click.option("--port", metavar="URL", help="Of the controller: /dev/ttyUSB0, COM3, socket://host:port, …  [default: that of the plan]")
+@click.option("--watch", type=PATH, metavar="FOLDER", help="The controller fires the camera by cable; its photographs appear in this folder.")
+@click.option("--name", help="What is photographed.  [default: the folder's name]")
+@click.option("--repeat-sweep", "repeat", type=click.IntRange(0), multiple=True, metavar="N", help="Take sweep N anew; may be given again.")
+@click.option("--patience", type=click.FloatRange(min=0), default=1800.0, show_default=True, metavar="S", help="Wait so long for what is away.")
+@click.option("--status", "order", flag_value="status", help="Say how far the capture is, and end.")
+@click.option("--pause", "order", flag_value="pause", help="Ask the run that takes CAPTURE to pause after this photograph.")
+@click.option("--resume", "order", flag_value="resume", help="Ask it to go on.")
+@click.option("--abort", "order", flag_value="abort", help="Ask it to end after this photograph; it can be gone on with.")
+@click.option("--live", type=PATH, metavar="PICTURE.png", help="Show what the camera sees, again and again, and how sharp it is; for focusing.")
+@click.option("--dry-run", is_flag=True, help="Say what the plan costs, and end.")
+@click.option("--style", type=click.Choice(["straight", "wavy", "curls"]), default="straight", show_default=True, help="Virtual hair.")
+@click.option("--scale", type=click.Choice(["tiny", "small", "medium"]), default="tiny", show_default=True, help="Size of the virtual capture.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Another number gives another virtual lock.")
+@click.option("--speed", type=POSITIVE, default=20.0, show_default=True, help="The virtual rig's time goes so many times as fast.")
+@common
+@click.pass_obj
+def capture(session, plan, folder, virtual, port, watch, name, repeat, patience, order, live, dry_run, style, scale, seed, speed):
+    """Photograph hair with a rig: a camera on a stage, and a turntable, on a GRBL or grblHAL controller.
+
+    PLAN.toml says what to photograph, and how the rig is wired; without it, the capture in CAPTURE is gone on with. Every
+    photograph is proven safe before the next is taken, so a run may end in any way: run it again. Ctrl-C ends it after the
+    photograph that is being taken, a second Ctrl-C at once.
+
+    \b
+    Examples:
+      strandscope capture --virtual -o lock
+      strandscope capture switch.toml -o switch --port /dev/ttyUSB0
+      strandscope capture -o switch
+      strandscope capture --pause -o switch
+    """
+    from .rig import attach, operate
+    from .rig import session as runs
+
+    report = session.report
+    if order and folder is None:  # `capture --status FOLDER`
+        plan, folder = None, plan
+    if live:
+        camera = operate.open_camera(operate.load_rig(plan).camera if plan else operate.CameraConfig())
+        operate.live(camera, live, report.event)
+    if folder is None and not dry_run:
+        raise click.UsageError("missing option '-o': the folder of the capture")
+    if order == "status":
+        told = attach.status(folder)
+        report.event(told)
+        report.show(terminal.table(attach.describe(told)))
+        return
+    if order:
+        attach.order(folder, order)
+        return
+    if repeat and not plan and attach.runs(folder):
+        for sweep in repeat:
+            attach.order(folder, attach.REPEAT, sweep=sweep)
+        return
+    params = runs.SessionParams(patience_s=patience)
+    orders = attach.Orders()
+    work = {"repeat": repeat, "orders": orders, "progress": report, "events": report.event}
+    from . import virtual_rig
+
+    hair = virtual_rig.hair_in(folder) if folder and not plan else None
+    if virtual or hair:
+        from .simulate import SimulateParams
+
+        hair, begun = hair or SimulateParams(style, scale, seed=seed), attach.plan_in(folder) if folder else None
+        rig = operate.Rig(plan=operate.load_rig(plan).plan if plan else begun or virtual_rig.virtual_plan(hair))
+        take = partial(virtual_rig.virtual_capture, folder, virtual_rig.VirtualParams(hair, speed), rig.plan, params, **work)
+    else:
+        rig = operate.load_rig(plan) if plan else operate.load_rig(folder / operate.FILE) if folder else operate.Rig()
+        rig = operate.changed(rig, port, watch, name)
+        take = partial(operate.capture, rig, folder, params, **work)
+    report.show(terminal.table(operate.describe(rig.plan)))
+    if dry_run:
+        return
+    with terminal.stops_politely(lambda: orders.add(attach.ABORT), report.note):
+        try:
+            made = take()
+        except runs.RunStopped as stopped:  # the run has said so
+            raise click.exceptions.Exit(INTERRUPTED) from stopped
+    report.done(made)
+
+
+@main_group.command("rig", short_help="Move a rig by hand: home, jog, look.")
+@click.argument("plan", type=PATH, required=False, metavar="[PLAN.toml]")
+@click.option("--ports", is_flag=True, help="List this machine's serial ports, and end.")
+@click.option("--virtual", is_flag=True, help="A simulated controller, camera and lock of hair.")
+@click.option("--port", metavar="URL", help="Of the controller: /dev/ttyUSB0, COM3, socket://host:port, …  [default: that of the plan]")
+@click.option("--picture", type=PATH, default=Path("live.png"), show_default=True, metavar="PICTURE.png", help="Where live pictures are written.")
+@click.option("--style", type=click.Choice(["straight", "wavy", "curls"]), default="straight", show_default=True, help="Virtual hair.")
+@click.option("--scale", type=click.Choice(["tiny", "small", "medium"]), default="tiny", show_default=True, help="Size of the virtual hair.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Another number gives another virtual lock.")
+@click.option("--speed", type=POSITIVE, default=4.0, show_default=True, help="The virtual rig's time goes so many times as fast.")
+@common
+@click.pass_obj
+def by_hand(session, plan, ports, virtual, port, picture, style, scale, seed, speed):
+    """Move a rig by commands, one a line on standard input, and show what its camera sees; for framing and focusing.
+
+    \b
+    Commands:
+      home         find the position with the switches      jog MM      move the focus by so much
+      unlock       take back an alarm                       turn DEG    turn the turntable by so much
+      stop         halt at once                             go DEG MM   go there
+      live on|off  write the live picture again and again   shutter     fire the shutter cable
+      quit         end
+
+    \b
+    Examples:
+      strandscope rig --virtual
+      strandscope rig switch.toml --port /dev/ttyUSB0
+    """
+    from .rig import desk, operate
+
+    report = session.report
+    if ports:
+        found = desk.ports()
+        report.event({"event": "ports", "ports": found})
+        report.show(terminal.table(found) if found else "no serial port was found")
+        return
+    rig = operate.changed(operate.load_rig(plan) if plan else operate.Rig(), port)
+    commands = iter(sys.stdin.readline, "")
+    if virtual:
+        from . import virtual_rig
+        from .simulate import SimulateParams
+
+        params = virtual_rig.VirtualParams(SimulateParams(style, scale, seed=seed), speed)
+        virtual_rig.virtual_by_hand(params, rig.plan if plan else None, commands, picture, report.event)
+    else:
+        operate.by_hand(rig, commands, picture, report.event)
+
+
 @main_group.command(short_help="Find the hairs in a capture, write them as curves.")
 @click.argument("capture", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, help="The strands file to write (.npz).")
@@ -456,34 +594,68 @@ def batch(session, captures, folder, listed, json_file, preset, params, method, 
         raise StrandscopeError(f"{failed} of {len(outcomes)} captures failed")
 
 
-@main_group.command(short_help="Find what is wrong with the rig, from a capture.")
-@click.argument("capture", type=PATH)
-@click.option("--from-features", is_flag=True, required=True, expose_value=False, help="From the hair itself: fibers must coincide across angles.")
-@click.option("-o", "--output", type=PATH, required=True, help="The calibration file to write (.json, .toml).")
+@main_group.command(short_help="Find what is wrong with the rig, from a printed target or from hair.")
+@click.argument("capture", type=PATH, required=False)
+@click.option("--target", is_flag=True, help="From a printed target: CAPTURE has photographs of it, at some angles and positions.")
+@click.option("--from-features", is_flag=True, help="From the hair itself: fibers must coincide across angles.")
+@click.option("-o", "--output", type=PATH, help="The calibration file to write (.json, .toml).")
+@click.option("--print-target", type=PATH, metavar="OUT.pdf", help="Write the target to print, with rulers to check the print, and do nothing else.")
+@click.option("--square-mm", type=POSITIVE, default=5.0, show_default=True, help="Width of a square of the target: for other fields of view.")
+@click.option("--ruler-mm", type=POSITIVE, default=100.0, show_default=True, help="How long the target's ruler of 100 mm is as it was printed.")
+@click.option("--start", type=PATH, metavar="RIG.json", help="With --from-features: begin with this calibration, as one from a target.")
 @click.option("--params", type=PATH, help="A TOML file with settings of the filter and of growing.")
 @click.option("--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given.")
 @click.option("--memory", type=Memory(), default="6GB", show_default=True, help="Memory to use at most; a capture that needs more is refused.")
 @click.option("--scheduler", metavar="tcp://HOST:PORT", help="Find the ridges on the Dask cluster of this scheduler.")
 @common
 @click.pass_obj
-def calibrate(session, capture, output, params, workers, memory, scheduler):
+def calibrate(session, capture, target, from_features, output, print_target, square_mm, ruler_mm, start, params, workers, memory, scheduler):
     """Find by how much the rig that took CAPTURE is not as its capture.json says.
 
-    Looks for the place and the tilt of the turntable's axis, the focus, the working distance, the angle of each sweep, and the
-    gain of the photographs. Each is told with its standard error. Hand the file to `reconstruct --calibration`; the
-    capture itself is not changed.
+    A printed target tells the pitch, the working distance, the place and the tilt of the turntable's axis, the focus, the direction of
+    the stage, and the lens's distortion. Hair tells the axis, the tilt, the focus, the angle of each sweep and the gain of the
+    photographs, and the working distance roughly. Each is told with its standard error. Hand the file to `reconstruct --calibration`;
+    the capture itself is not changed. docs/calibration.md says how to print, mount and photograph the target.
 
     \b
     Example:
-      strandscope calibrate lock --from-features -o out/rig.json
-      strandscope reconstruct lock --calibration out/rig.json -o out/strands.npz
+      strandscope calibrate --print-target target.pdf
+      strandscope calibrate board --target -o out/rig.json
+      strandscope calibrate lock --from-features --start out/rig.json -o out/lock.json
+      strandscope reconstruct lock --calibration out/lock.json -o out/strands.npz
     """
+    if print_target:
+        if capture or target or from_features or output:
+            raise click.UsageError("--print-target stands alone: it writes a PDF")
+        from .rig import target as boards
+        from .rig import target_pdf
+
+        target_pdf.print_target(print_target, boards.Target().of_squares(square_mm))
+        session.report.done(print_target)
+        return
+    if target == from_features:
+        raise click.UsageError("expected one of --target and --from-features")
+    if capture is None or output is None:
+        raise click.UsageError("expected a CAPTURE, and -o with the file to write")
+    if target:
+        from .rig import target as boards
+        from .rig import target_calibrate, target_words
+
+        if start or params or scheduler:
+            raise click.UsageError("--start, --params and --scheduler go with --from-features")
+        board = boards.Target().of_squares(square_mm * ruler_mm / 100)
+        told = target_calibrate.calibrate_by_target(capture, output, board, progress=session.report, workers=workers)
+        session.report.show(terminal.table(target_words.describe(told)))
+        for warning in target_words.warnings(told):
+            session.report.note(warning)
+        session.report.done(output)
+        return
     from . import pipeline
     from .rig.calibrate import describe
 
     parameters = pipeline.read_toml(params) if params else pipeline.preset()
     limits = {"workers": workers, "memory_bytes": memory, "progress": session.report, "scheduler": scheduler, "tell": session.report.note}
-    found = pipeline.calibrate(capture, output, parameters, **limits)
+    found = pipeline.calibrate(capture, output, parameters, start=start, **limits)
     session.report.show(terminal.table(describe(found)))
     session.report.done(output)
 
@@ -523,9 +695,9 @@ def overlay(session, capture, strands, output, sweep, angle, position, color, ca
         raise click.UsageError("--sweep and --angle exclude each other")
     photographs, curves = load_capture(capture), load_strands(strands)
     if calibration:
-        from .rig.calibrate import load_errors
+        from .rig.calibrate import calibrated
 
-        photographs = load_errors(calibration).corrected(photographs)
+        photographs = calibrated(calibration, photographs)
     shot = compare.choose_shot(photographs, curves, sweep, angle, position)
     session.report.show(compare.overlay(photographs, curves, shot, output, color))
     session.report.done(output)

@@ -371,7 +371,7 @@ def in_focus(capture: Capture, strands: Strands, shot: Shot) -> tuple[np.ndarray
     """Pixels (S, 2, 2) of the ends (column, row) of all segments within the depth of field, and their curves (S,)."""
     sweep = capture.sweeps[shot.sweep]
     d, optics = sweep.positions_mm[shot.photograph], capture.optics
-    *pixel, w = pixels(strands.points_mm, sweep.angle_deg, d, optics).T
+    *pixel, w = pixels(strands.points_mm, sweep.angle_deg, d, optics, capture.shape).T
     pixel = np.stack(pixel, axis=1)
     curve = np.repeat(np.arange(len(strands)), np.diff(strands.offsets))
     sharp = np.abs(w - d) <= depth_of_field_mm(optics) / 2

@@ -26,11 +26,24 @@ class Optics:
     aperture_cone_deg: float  # full angle of the cone of rays that meet in a point of the plane of focus
     tilt_deg: float = 0.0  # how far the upper end of the rotation axis leans to the right in the image
     tilt_towards_deg: float = 0.0  # and how far towards the camera
+    travel_deg: float = 0.0  # the stage leads the camera to the right of the line of sight by this as it draws back (d grows)
+    travel_up_deg: float = 0.0  # and upwards
+    k1_per_mm2: float = 0.0  # distortion: a pixel r mm from the middle of the image belongs 1 + k1 r² + k2 r⁴ times as far from it
+    k2_per_mm4: float = 0.0
 
     def reduced(self, by: int) -> "Optics":
         """Those of photographs of which ``by`` times ``by`` pixels have become one."""
         col, row = ((px - 0.5 * (by - 1)) / by for px in (self.axis_col_px, self.axis_row_px))
         return replace(self, pitch_mm=by * self.pitch_mm, axis_col_px=col, axis_row_px=row)
+
+    @property
+    def displaces(self) -> bool:
+        """Whether photographs show things aside of where an ideal lens on a stage along its line of sight would."""
+        return any((self.travel_deg, self.travel_up_deg, self.k1_per_mm2, self.k2_per_mm4))
+
+    def ideal(self) -> "Optics":
+        """Those of a rig that neither leans nor distorts: under them pixels are what photographs show, not set right."""
+        return replace(self, tilt_deg=0.0, tilt_towards_deg=0.0, travel_deg=0.0, travel_up_deg=0.0, k1_per_mm2=0.0, k2_per_mm4=0.0)
 
 
 # ---- single coordinates: floats or arrays, also compiled into kernels ------------------------------------------------
@@ -80,6 +93,23 @@ def to_image(col, row, pitch_mm, axis_col_px, axis_row_px):
     return (col - axis_col_px) * pitch_mm, (axis_row_px - row) * pitch_mm
 
 
+def straighten(x, y, k1, k2):
+    """Where a point of the image, mm from its middle, belongs without the lens's distortion (the radial terms of Brown 1971, sec. 2)."""
+    square = x * x + y * y
+    scale = 1.0 + square * (k1 + square * k2)
+    return x * scale, y * scale
+
+
+def distort(x, y, k1, k2):
+    """Where the lens puts a point of the image, mm from its middle: the inverse of ``straighten``, to 1e-9 for distortions up to a tenth."""
+    at_x, at_y = x, y
+    for _ in range(12):
+        square = at_x * at_x + at_y * at_y
+        scale = 1.0 + square * (k1 + square * k2)
+        at_x, at_y = x / scale, y / scale
+    return at_x, at_y
+
+
 # ---- whole arrays ----------------------------------------------------------------------------------------------------
 
 
@@ -99,14 +129,42 @@ def tilt_of(optics):
     return np.cos(right), np.sin(right), np.cos(towards), np.sin(towards)
 
 
+def travelled(optics, focus_mm):
+    """How far right and up (mm) the stage has led the camera off its line of sight where the plane of focus is at d = focus_mm."""
+    return np.tan(np.radians(optics.travel_deg)) * focus_mm, np.tan(np.radians(optics.travel_up_deg)) * focus_mm
+
+
+def set_right(col, row, focus_mm, optics, shape):
+    """Pixels of a photograph of ``shape`` (rows, columns) -> (column, row) where a lens that does not distort, on a stage that moves
+    along its line of sight, would have put what is in focus."""
+    middle_col, middle_row, pitch = (shape[1] - 1) / 2, (shape[0] - 1) / 2, optics.pitch_mm
+    x, y = straighten((col - middle_col) * pitch, (row - middle_row) * pitch, optics.k1_per_mm2, optics.k2_per_mm4)
+    right, up = travelled(optics, focus_mm)
+    return middle_col + (x + right) / pitch, middle_row + (y - up) / pitch
+
+
+def as_photographed(col, row, focus_mm, optics, shape):
+    """Where a photograph of ``shape`` (rows, columns) shows what belongs to a pixel: the inverse of ``set_right``."""
+    middle_col, middle_row, pitch = (shape[1] - 1) / 2, (shape[0] - 1) / 2, optics.pitch_mm
+    right, up = travelled(optics, focus_mm)
+    x, y = distort((col - middle_col) * pitch - right, (row - middle_row) * pitch + up, optics.k1_per_mm2, optics.k2_per_mm4)
+    return middle_col + x / pitch, middle_row + y / pitch
+
+
 def object_points(points_mm, angle_deg):
     """points_mm (..., 3) of the camera frame at a turntable angle -> (..., 3) of the object frame, mm."""
     theta = np.radians(angle_deg)
     return np.stack(turn_back(*np.moveaxis(np.asarray(points_mm), -1, 0), np.cos(theta), np.sin(theta)), axis=-1)
 
 
-def pixels(points_mm, angle_deg, focus_mm, optics):
-    """Where points (..., 3) mm of the object frame appear in a photograph: (..., 3) of column, row (px) and w (mm)."""
+def pixels(points_mm, angle_deg, focus_mm, optics, shape=None):
+    """Where points (..., 3) mm of the object frame appear in a photograph: (..., 3) of column, row (px) and w (mm).
+
+    With its ``shape`` (rows, columns), that is as the lens and the stage of ``optics`` show what is near the plane of focus.
+    """
     u, v, w = np.moveaxis(camera_points(points_mm, angle_deg, optics), -1, 0)
     u, v = project(u, v, w, focus_mm, optics.working_distance_mm)
-    return np.stack([*to_pixel(u, v, optics.pitch_mm, optics.axis_col_px, optics.axis_row_px), w], axis=-1)
+    col, row = to_pixel(u, v, optics.pitch_mm, optics.axis_col_px, optics.axis_row_px)
+    if shape is not None:
+        col, row = as_photographed(col, row, focus_mm, optics, shape)
+    return np.stack([col, row, w], axis=-1)

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from .advection import advect, captured_density
-from .capture import Capture, features_path, load_capture
+from .capture import Capture, Sweep, features_path, load_capture
 from .cluster import Cluster, Hands, unheard
 from .confidence import confidence, expected_error
 from .crew import Threads
@@ -45,6 +45,7 @@ from .rig.calibrate import (
     Calibration,
     RigErrors,
     Solution,
+    calibrated,
     drift,
     gains,
     light,
@@ -115,7 +116,12 @@ def reconstruct(
     """
     capture = load_capture(capture_path if scheduler is None else Path(capture_path).resolve())
     if calibration is not None:
-        capture = load_errors(calibration).corrected(capture)
+        capture = calibrated(calibration, capture)
+        if capture.features and scheduler is not None:
+            raise StrandscopeError(
+                f"{capture.folder}: has features in place of photographs, and workers of a cluster read these as they are; "
+                "leave --scheduler away to have them corrected (--calibration)"
+            )
     parameters = resolve(capture, parameters)
     capture = capture.reduced(parameters.ridges.reduce)
     work = work_folder(capture, Path(out), parameters)
@@ -179,7 +185,7 @@ def find_features(
     capture: Capture, work: Path, parameters: Parameters, workers: int, progress: Progress, cluster: Cluster | None = None
 ) -> list[SweepFeatures]:
     """The features of every sweep, filtered from the photographs, here or on a cluster, unless ``work`` has them from a run before, or
-    the capture itself."""
+    the capture itself; these are as a photograph shows them, and are set right for what is known of the rig."""
     missing = [i for i in range(len(capture.sweeps)) if not all(path(work, i).is_file() for path in _PRODUCTS)]
     shape, total = capture.shape, sum(len(capture.sweeps[i].files) for i in missing)
     jobs = (job for i in missing for job in _jobs(capture, i, parameters, shape))
@@ -200,7 +206,16 @@ def find_features(
                     np.save(part, np.stack(pictures))
             save_features(features_path(work, i), pack(sweep.angle_deg, sweep.positions_mm, shape, ridges))
     progress("finding ridges", total, total)
-    return [load_features(features_path(work, i)) for i in range(len(capture.sweeps))]
+    found = [load_features(features_path(work, i)) for i in range(len(capture.sweeps))]
+    if not capture.features:
+        return found
+    return [f if _as_stored(f, s, capture.optics) else seen_by(f, s, capture.optics) for f, s in zip(found, capture.sweeps, strict=True)]
+
+
+def _as_stored(features: SweepFeatures, sweep: Sweep, optics: Optics) -> bool:
+    """Whether nothing is known of the rig that the stored features of a sweep do not have already."""
+    same = np.allclose(np.sort(sweep.positions_mm), features.positions_mm, rtol=0, atol=1e-6) and abs(sweep.angle_deg - features.angle_deg) < 1e-9
+    return same and optics == optics.ideal()
 
 
 def _jobs(capture: Capture, i: int, parameters: Parameters, shape: tuple[int, int]) -> Iterator[tuple]:
@@ -359,21 +374,27 @@ def calibrate(
     progress: Progress = silent,
     scheduler: str | None = None,
     tell: Callable[[str], None] = unheard,
+    start: Path | None = None,
 ) -> Calibration:
     """Find the errors of the rig that took a capture from the capture itself, write them to ``out`` (.json, .toml); returns them.
 
     The photographs are filtered once, on a cluster if there is a ``scheduler``; then curves are grown with the rig as known so far,
-    the rig is solved for, and so on until it stays. Raises CaptureError, StrandscopeError as ``reconstruct`` does, and where too few
+    the rig is solved for, and so on until it stays. What a calibration file ``start`` tells, as from a printed target, is where that begins;
+    what hair does not tell is kept as it has it. Raises CaptureError, StrandscopeError as ``reconstruct`` does, and where too few
     fibers are seen.
     """
     capture = load_capture(capture_path if scheduler is None else Path(capture_path).resolve())
     parameters = resolve(capture, replace(parameters, ridges=replace(parameters.ridges, reduce=1)))  # errors are told in whole pixels
-    stated = replace(capture, optics=replace(capture.optics, tilt_deg=0.0, tilt_towards_deg=0.0))
+    begun = RigErrors()
+    if start is not None:
+        calibrated(start, capture)  # raises where it is for another rig
+        begun = load_errors(start)
+    stated = replace(capture, optics=capture.optics.ideal())  # features as the photographs show them
     work = work_folder(stated, Path(out), parameters)
     with Cluster(scheduler, [capture.folder], tell) if scheduler else nullcontext() as cluster:
         sweeps = find_features(stated, work, parameters, workers, progress, cluster)
     _check_memory(sweeps, 2 * memory_bytes // 3)  # some are turned and joined anew in each round
-    errors, solution, biased = _solved(capture, sweeps, parameters, workers, progress)
+    errors, solution, biased = _solved(capture, sweeps, parameters, workers, progress, begun)
     told = [gains(np.load(light_path(work, i))) for i in range(len(sweeps))]
     calibration = _summed_up(capture, errors, solution, biased, told)
     save_calibration(out, calibration)
@@ -381,11 +402,11 @@ def calibrate(
 
 
 def _solved(
-    capture: Capture, sweeps: list[SweepFeatures], parameters: Parameters, workers: int, progress: Progress
+    capture: Capture, sweeps: list[SweepFeatures], parameters: Parameters, workers: int, progress: Progress, begun: RigErrors
 ) -> tuple[RigErrors, Solution, np.ndarray]:
     """The errors of the rig by which the sweeps' features agree best, the last step towards them, and how far off each of its
     unknowns may be because the biases of depth from focus are not wholly those that the equations have."""
-    errors, moved_px = RigErrors(), np.inf
+    errors, moved_px = begun, np.inf
     for number, reach_px in enumerate(ROUNDS_PX):
 
         def growing(_stage, done, total, number=number):

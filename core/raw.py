@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
 
@@ -77,6 +78,9 @@ class Header:
     rows: int  # of the mosaic or image
     cols: int
     taken: tuple[float, int] | None  # seconds and shot number, in the order of taking; None where the file does not tell
+    shutter_s: float | None = None  # None where the file does not tell, as of the next two
+    f_number: float | None = None
+    iso: float | None = None
 
 
 def read_header(path: Path) -> Header:
@@ -100,7 +104,8 @@ def read_header(path: Path) -> Header:
             raw.open_file(str(path))
             when = raw.other
             taken = (when.timestamp.timestamp(), when.shot_order) if when.timestamp.year > 1970 else None
-            return Header(raw.sizes.height, raw.sizes.width, taken)
+            exposure = (float(value) if 0 < value < 1e6 else None for value in (when.shutter_speed, when.aperture, when.iso_speed))
+            return Header(raw.sizes.height, raw.sizes.width, taken, *exposure)
     except (rawpy.LibRawError, OSError, ValueError) as error:
         raise CaptureError(f"{path}: LibRaw cannot read this photograph, it may be cut short or damaged ({_one_line(error)})") from error
 
@@ -275,7 +280,16 @@ def _by_libraw(path: Path) -> Iterator[tuple[np.ndarray, _Sensor]]:
         raise CaptureError(f"{path}: LibRaw cannot read this photograph, it may be cut short or damaged ({_one_line(error)})") from error
 
 
-def write_dng(path: Path, mosaic: np.ndarray, black: int, white: int) -> None:
+@dataclass(frozen=True)
+class Shot:
+    """What a camera notes of a photograph."""
+
+    taken: datetime
+    shutter_s: float
+    f_number: float
+
+
+def write_dng(path: Path, mosaic: np.ndarray, black: int, white: int, shot: Shot | None = None) -> None:
     """Write a mosaic (2H, 2W) uint16, RGGB, as an uncompressed DNG that LibRaw reads back unchanged; atomically."""
     import tifffile
 
@@ -297,6 +311,12 @@ def write_dng(path: Path, mosaic: np.ndarray, black: int, white: int) -> None:
         (272, "s", 0, CAMERA_NAME, True),  # Model
         (274, "H", 1, 1, True),  # Orientation
     ]
+    if shot:
+        tags += [
+            (306, "s", 0, shot.taken.strftime("%Y:%m:%d %H:%M:%S"), True),  # DateTime
+            (33434, "2I", 1, (round(shot.shutter_s * 1e6), 1_000_000), True),  # ExposureTime
+            (33437, "2I", 1, _rationals([shot.f_number]), True),  # FNumber
+        ]
     with atomic(path) as part:
         tifffile.imwrite(part, mosaic, photometric="CFA", planarconfig=1, subfiletype=0, metadata=None, extratags=tags)
 

@@ -73,6 +73,11 @@ class Misalignment:
     turntable_step_deg: float = 0.0  # the step in the middle turns this much too far, once: all later sweeps are off
     every_step_deg: float = 0.0  # every step turns this much too far
     gain_drift: float = 0.0  # in each sweep the photographs gain this much light from the first to the last, in parts
+    pitch_parts: float = 0.0
+    travel_deg: float = 0.0
+    travel_up_deg: float = 0.0
+    k1_per_mm2: float = 0.0
+    k2_per_mm4: float = 0.0
 
     def errors(self, capture: Capture) -> RigErrors:
         """The same for the sweeps of a capture."""
@@ -80,7 +85,8 @@ class Misalignment:
         angles = self.every_step_deg * k + self.turntable_step_deg * (k >= len(k) // 2)
         gains = tuple(tuple(1 + self.gain_drift * np.linspace(-0.5, 0.5, len(sweep.files))) for sweep in capture.sweeps)
         rig = (self.axis_px, self.tilt_deg, self.tilt_towards_deg, self.focus_mm, self.working_distance_mm)
-        return RigErrors(*rig, tuple(float(a) for a in angles), gains)
+        lens = (self.pitch_parts, self.travel_deg, self.travel_up_deg, self.k1_per_mm2, self.k2_per_mm4)
+        return RigErrors(*rig, tuple(float(a) for a in angles), gains, *lens)
 
 
 # A rig that was set up with care and never checked.
@@ -364,6 +370,21 @@ def drawing(hair: Hair, angle_deg: float, shaded: Shade | None = None, optics: O
     thick = 4 * hair.radius_mm.max()
     span = np.array([where[:, 2].min() - thick, where[:, 2].max() + thick], np.float32)
     return Drawing(ends, hair.fiber[order], colors, span)
+
+
+def as_photographed(drawn: Drawing, optics: Optics, focus_mm: float, shape: tuple[int, int]) -> Drawing:
+    """What is drawn as a photograph of ``shape`` (rows, columns) at d = focus_mm has it, where the lens distorts and the stage leads the
+    camera off its line of sight. A point moves along the plane of its depth, so that the middle of its blur is where it belongs."""
+    if not optics.displaces:
+        return drawn
+    ends = drawn.ends.astype(np.float64)
+    right, up = geometry.travelled(optics, focus_mm)
+    left_mm, top_mm = (optics.axis_col_px - (shape[1] - 1) / 2) * optics.pitch_mm, (optics.axis_row_px - (shape[0] - 1) / 2) * optics.pitch_mm
+    for u, v, w in (ends.T[:3], ends.T[3:6]):
+        scale = optics.working_distance_mm / (optics.working_distance_mm + focus_mm - w)
+        x, y = geometry.distort(left_mm + (u - right) * scale, top_mm - (v - up) * scale, optics.k1_per_mm2, optics.k2_per_mm4)
+        u[:], v[:] = (x - left_mm) / scale, (top_mm - y) / scale
+    return replace(drawn, ends=ends.astype(np.float32))
 
 
 def photograph(hair: Drawing, background: np.ndarray, optics: Optics, focus_mm: float, through: Lens) -> np.ndarray:
@@ -658,7 +679,7 @@ def simulate(out: Path, params: SimulateParams, progress: Progress = silent, wor
         rig = params.misalignment.errors(capture).corrected(capture)
         _photographs(rig, hair, params, progress, pool)
         if not capture.truth_path.is_file():
-            _write_truth(rig, lock, hair, params, progress, pool)
+            take_truth(rig, lock, hair, params, progress, pool)
     save_capture(replace(capture, unknown={"simulation": asdict(params)}))
     return load_capture(out)
 
@@ -686,6 +707,8 @@ def begin(out: Path, params: SimulateParams, more: dict | None = None) -> bool:
         if not journal.is_file():
             raise StrandscopeError(f"{out}: holds files that no simulation made; expected a new or empty folder for the capture")
         found = json.loads(journal.read_text(encoding="utf-8"))
+        if isinstance(found, dict) and isinstance(found.get("misalignment"), dict):  # one made before there were as many errors
+            found["misalignment"] = asdict(Misalignment()) | found["misalignment"]
     except OSError as error:
         raise explain(error, out) from error
     except ValueError as error:
@@ -700,17 +723,46 @@ def begin(out: Path, params: SimulateParams, more: dict | None = None) -> bool:
     return (out / FILE_NAME).is_file()
 
 
+@dataclass(frozen=True)
+class Studio:
+    """Known hair before its board and light, to be photographed at any angle and focus."""
+
+    params: SimulateParams
+    optics: Optics
+    hair: Hair
+    fog: Density
+    background: np.ndarray  # (4, rows, columns) of the board
+    gain: float  # of the exposure
+    reach_mm: float  # few fibers fly off farther
+
+    def at(self, angle_deg: float) -> Drawing:
+        """The hair turned by an angle, shaded; it serves for all photographs there."""
+        shaded = shade(self.hair, self.fog, LOOKS[self.params.style], angle_deg, self.optics.working_distance_mm)
+        return drawing(self.hair, angle_deg, replace(shaded, color=shaded.color * np.float32(self.gain)), self.optics)
+
+    def mosaic(self, drawn: Drawing, focus_mm: float, f_number: float, rng, brighter: float = 1.0) -> np.ndarray:
+        """The mosaic (2 rows, 2 columns) uint16 that the camera takes at a focus and an aperture; ``brighter`` is its gain."""
+        through = replace(self.optics, aperture_cone_deg=stopped_cone_deg(self.params, f_number))
+        disc = lens(lens_count(through, self.reach_mm + abs(focus_mm)), aperture_radius_mm(through), len(self.background[0]) + 1, rng)
+        seen = as_photographed(drawn, through, focus_mm, self.background.shape[1:])
+        planes = photograph(seen, self.background, through, focus_mm, disc)
+        return expose(planes * np.float32(brighter), self.params.full_well_e, self.params.read_noise_e, rng)
+
+
+def studio(params: SimulateParams, optics: Optics, hair: Hair) -> Studio:
+    """Board, light and exposure for hair."""
+    look, fog = LOOKS[params.style], density(hair)
+    reach = float(np.percentile(np.hypot(hair.points_mm[:, 0], hair.points_mm[:, 2]), 99))
+    background = board(optics, (params.size.rows, params.size.columns), look)
+    return Studio(params, optics, hair, fog, background, _gain(hair, fog, look, params), reach)
+
+
 def _photographs(capture: Capture, hair: Hair, params: SimulateParams, progress: Progress, pool: ThreadPoolExecutor) -> None:
     """Take all photographs that are not there yet."""
-    scale, optics, look = params.size, capture.optics, LOOKS[params.style]
-    background = board(optics, (scale.rows, scale.columns), look)
-    fog = density(hair)
-    gain = _gain(hair, fog, look, params)
-    reach = float(np.percentile(np.hypot(hair.points_mm[:, 0], hair.points_mm[:, 2]), 99))  # few fibers fly off farther
-    stopped = replace(optics, aperture_cone_deg=stopped_cone_deg(params))
-    sequences = [(s.angle_deg, d, f, optics, g) for s in capture.sweeps for d, f, g in zip(s.positions_mm, s.files, s.gains, strict=True)]
+    camera, opened = studio(params, capture.optics, hair), params.open_f_number
+    sequences = [(s.angle_deg, d, f, opened, g) for s in capture.sweeps for d, f, g in zip(s.positions_mm, s.files, s.gains, strict=True)]
     if stills := capture.turntable:
-        sequences += [(a, stills.focus_mm, f, stopped, 1.0) for a, f in zip(stills.angles_deg, stills.files, strict=True)]
+        sequences += [(a, stills.focus_mm, f, params.turntable_f_number, 1.0) for a, f in zip(stills.angles_deg, stills.files, strict=True)]
     by_angle: dict[float, list] = {}
     for number, (angle, *shot) in enumerate(sequences):
         by_angle.setdefault(angle, []).append((number, *shot))
@@ -720,15 +772,12 @@ def _photographs(capture: Capture, hair: Hair, params: SimulateParams, progress:
         done += len(shots) - len(missing)
         if not missing:
             continue
-        shaded = shade(hair, fog, look, angle, optics.working_distance_mm)
-        drawn = drawing(hair, angle, replace(shaded, color=shaded.color * np.float32(gain)), optics)
+        drawn = camera.at(angle)
 
         def take(shot, drawn=drawn):
-            number, focus, file, through, brighter = shot
+            number, focus, file, f_number, brighter = shot
             rng = np.random.default_rng([params.seed, 2, number])
-            disc = lens(lens_count(through, reach + abs(focus)), aperture_radius_mm(through), scale.rows + 1, rng)
-            planes = photograph(drawn, background, through, focus, disc)
-            write_dng(capture.folder / file, expose(planes * np.float32(brighter), params.full_well_e, params.read_noise_e, rng), BLACK, WHITE)
+            write_dng(capture.folder / file, camera.mosaic(drawn, focus, f_number, rng, brighter), BLACK, WHITE)
 
         for _ in each_of(pool, take, missing):
             done += 1
@@ -746,9 +795,11 @@ def each_of(pool: ThreadPoolExecutor, work, items):
             future.cancel()
 
 
-def stopped_cone_deg(params: SimulateParams) -> float:
-    """Full angle of the cone at the f-number of the turntable sequence; the radius of the aperture goes with 1 / f-number."""
-    tangent = math.tan(math.radians(params.aperture_cone_deg) / 2) * params.open_f_number / params.turntable_f_number
+def stopped_cone_deg(params: SimulateParams, f_number: float) -> float:
+    """Full angle of the cone at an f-number; the radius of the aperture goes with 1 / f-number."""
+    if f_number == params.open_f_number:
+        return params.aperture_cone_deg
+    tangent = math.tan(math.radians(params.aperture_cone_deg) / 2) * params.open_f_number / f_number
     return math.degrees(2 * math.atan(tangent))
 
 
@@ -758,7 +809,7 @@ def _gain(hair: Hair, fog: Density, look: Look, params: SimulateParams) -> float
     return params.exposure / float(np.percentile(np.concatenate(shades), 99))
 
 
-def _write_truth(capture: Capture, lock: Groom, hair: Hair, params: SimulateParams, progress: Progress, pool: ThreadPoolExecutor) -> None:
+def take_truth(capture: Capture, lock: Groom, hair: Hair, params: SimulateParams, progress: Progress, pool: ThreadPoolExecutor) -> None:
     """truth.npz: the fibers, samples of them inside the captured volume, and how much of the aperture sees each."""
     at = samples(lock, *seen_volume(params))
     seen = np.zeros((len(at.points_mm), len(capture.sweeps)), np.float16)

@@ -77,6 +77,7 @@ def simulate_features(
         if not features_path(out / FOLDER, k).is_file():
             rng = np.random.default_rng([params.seed, 3, k])
             ridges = _ridges(at, seen[:, k].astype(np.float32), sweep, rig.optics, shape, observe, rng)
+            ridges = [_as_photographed(r, d, rig.optics, shape) for r, d in zip(ridges, sweep.positions_mm, strict=True)]
             found = pack(capture.sweeps[k].angle_deg, capture.sweeps[k].positions_mm, shape, ridges)
             _write_pictures(out / FOLDER, k, at, sweep, rig.optics, shape, observe)
             save_features(features_path(out / FOLDER, k), found)
@@ -127,6 +128,15 @@ def _ridges(at: Samples, seen, sweep, optics, shape, observe: ObserveParams, rng
     order = np.argsort(frames, kind="stable")
     rows, ends = rows[order], np.searchsorted(frames[order], np.arange(len(sweep.positions_mm) + 1))
     return [Ridges(*np.ascontiguousarray(rows[a:b].T)) for a, b in pairwise(ends)]
+
+
+def _as_photographed(ridges: Ridges, focus_mm: float, optics: geometry.Optics, shape: tuple[int, int]) -> Ridges:
+    """Ridges where a lens that distorts, on a stage that leads it aside, shows them; those that leave the photograph are dropped."""
+    if not optics.displaces:
+        return ridges
+    col, row = (np.float32(a) for a in geometry.as_photographed(ridges.col, ridges.row, focus_mm, optics, shape))
+    inside = (col >= 0) & (col <= shape[1] - 1) & (row >= 0) & (row <= shape[0] - 1)
+    return Ridges(*(a[inside] for a in (col, row, ridges.angle, ridges.strength, ridges.breadth)))
 
 
 def _blurred(rows: np.ndarray, alone: tuple[float, float], rng) -> None:

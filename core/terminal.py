@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -32,6 +32,11 @@ class Reporter:
     def note(self, text: str) -> None:
         """What a reader should know while the work goes on; one line on stderr."""
         print(f"strandscope: {text}", file=sys.stderr, flush=True)
+
+    def event(self, event: dict) -> None:
+        """What work that others can attach to tells of itself; its messages are notes."""
+        if event.get("message"):
+            self.note(event["message"])
 
     def done(self, output: Path) -> None:
         """The work succeeded, and what came of it is at ``output``."""
@@ -122,6 +127,9 @@ class Events(Reporter):
     def note(self, text):
         self._print(event="note", message=text)
 
+    def event(self, event):
+        self._print(**event)
+
     def done(self, output):
         self._print(event="done", output=str(output))
 
@@ -161,6 +169,29 @@ def interruptible() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)  # None: not of Python, as in Blender
+
+
+@contextmanager
+def stops_politely(stop: Callable[[], None], note: Callable[[str], None]) -> Iterator[None]:
+    """The first Ctrl-C, or request to end, calls ``stop``, which must be quick; a second one interrupts."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handler(_number, _frame):
+        for number in before:
+            signal.signal(number, signal.default_int_handler)
+        stop()
+        note("ending after this photograph; once more: at once")
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number in before:
+        signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, signal.SIG_DFL if old is None else old)
 
 
 def stop_with_parent() -> None:

@@ -6,7 +6,7 @@ import bpy
 
 from ...core.errors import StrandscopeError
 from ...core.strands import load_strands, save_strands
-from .. import hair
+from .. import hair, pictures
 from ..jobs import Command, JobOperator
 from ..props import preferences
 from .bring_in import show_strands
@@ -97,20 +97,10 @@ class STRANDSCOPE_OT_open_comparison(bpy.types.Operator):
 
     def execute(self, context):
         try:
-            image = bpy.data.images.load(context.scene.strandscope.comparison, check_existing=True)
+            pictures.show(context, Path(context.scene.strandscope.comparison))
         except RuntimeError as error:
             self.report({"ERROR"}, " ".join(str(error).split()))
             return {"CANCELLED"}
-        image.reload()
-        if bpy.app.background:
-            return {"FINISHED"}
-        bpy.ops.wm.window_new()
-        area = context.window_manager.windows[-1].screen.areas[0]
-        area.type = "IMAGE_EDITOR"
-        area.spaces.active.image = image
-        region = next(region for region in area.regions if region.type == "WINDOW")
-        with context.temp_override(window=context.window_manager.windows[-1], area=area, region=region):
-            bpy.ops.image.view_all(fit_view=True)
         return {"FINISHED"}
 
 

@@ -32,6 +32,8 @@ RIG = ("axis", "tilt", "tilt_towards", "focus", "scale")  # unknowns of the whol
 BIASES = 3  # and of depth from focus: by crowding, by faintness (mm), by curvature (mm²)
 FIRST_SWEEP = len(RIG) + BIASES  # place of the first sweep's angle (rad) among the unknowns
 TUKEY = 4.0  # observations this many robust deviations off are not heard
+TOLD_BY_TARGETS = ("pitch_parts", "travel_deg", "travel_up_deg", "k1_per_mm2", "k2_per_mm4")  # errors that older files lack
+OF_THE_FRAME = ("axis_col_px", "axis_row_px", "aperture_cone_deg")  # stated optics that differ where a photograph is cut out
 LEAST_SIGMA_MM = 1e-6
 LEAST_SIGHTINGS = 3  # of a point across the line of sight
 SURE = 3.0  # an error of this many standard errors is one
@@ -59,6 +61,12 @@ class RigErrors:
     working_distance_mm: float = 0.0
     angles_deg: tuple[float, ...] = ()  # each sweep is turned this much too far; empty: none
     gains: tuple[tuple[float, ...], ...] = ()  # light of each photograph of each sweep, about 1; empty: all alike
+    # what a printed target tells beside the rest, and hair does not
+    pitch_parts: float = 0.0  # a pixel is wider by these parts of it than the working distance makes it
+    travel_deg: float = 0.0  # the stage leads the camera to the right of its line of sight as it draws back
+    travel_up_deg: float = 0.0  # and upwards
+    k1_per_mm2: float = 0.0  # distortion, as Optics has it
+    k2_per_mm4: float = 0.0
 
     def corrected(self, capture: Capture) -> Capture:
         """The capture with the optics, positions, angles and gains that it truly has. Raises StrandscopeError if it has other sweeps."""
@@ -66,10 +74,14 @@ class RigErrors:
         optics = replace(
             optics,
             working_distance_mm=distance,
-            pitch_mm=optics.pitch_mm * distance / optics.working_distance_mm,
+            pitch_mm=optics.pitch_mm * distance / optics.working_distance_mm * (1 + self.pitch_parts),
             axis_col_px=optics.axis_col_px + self.axis_px,
             tilt_deg=optics.tilt_deg + self.tilt_deg,
             tilt_towards_deg=optics.tilt_towards_deg + self.tilt_towards_deg,
+            travel_deg=optics.travel_deg + self.travel_deg,
+            travel_up_deg=optics.travel_up_deg + self.travel_up_deg,
+            k1_per_mm2=optics.k1_per_mm2 + self.k1_per_mm2,
+            k2_per_mm4=optics.k2_per_mm4 + self.k2_per_mm4,
         )
         angles = self.angles_deg or (0.0,) * len(capture.sweeps)
         gains = self.gains or tuple(sweep.gains for sweep in capture.sweeps)
@@ -373,6 +385,7 @@ def describe(calibration: Calibration) -> list[tuple[str, str] | None]:
         row("focus", errors.focus_mm, uncertain.focus_mm, ".4f", "mm", "towards the camera"),
         row("working distance", errors.working_distance_mm, uncertain.working_distance_mm, ".2f", "mm", "with the camera's field of view as stated"),
     ]
+    rows += [(name, f"{value:+{form}} {unit}  as the target told") for name, value, form, unit in of_lens(errors) if value]
     if calibration.every_step_deg != (0.0, 0.0):
         rows.append(row("every step", *calibration.every_step_deg, ".4f", "°", "too far"))
     rows += [row(f"step to sweep {s.sweep}", s.angle_deg, s.error_deg, ".4f", "°", "too far, once") for s in calibration.slips]
@@ -396,10 +409,26 @@ def describe(calibration: Calibration) -> list[tuple[str, str] | None]:
     return rows
 
 
+def of_lens(errors: RigErrors) -> list[tuple[str, float, str, str]]:
+    """(name, value, format, unit) of the errors that only a printed target tells."""
+    return [
+        ("pitch", 100 * errors.pitch_parts, ".3f", "%"),
+        ("travel", errors.travel_deg, ".4f", "°"),
+        ("travel up", errors.travel_up_deg, ".4f", "°"),
+        ("distortion k1", errors.k1_per_mm2, ".3g", "1/mm²"),
+        ("distortion k2", errors.k2_per_mm4, ".3g", "1/mm⁴"),
+    ]
+
+
 def save_calibration(path: Path, calibration: Calibration) -> None:
     """Write a calibration as JSON, or TOML if the file's name ends so, atomically."""
-    head = {"format": FORMAT, "version": VERSION, **asdict(calibration)}
-    head["drifts"] = [[value, error if np.isfinite(error) else -1.0] for value, error in calibration.drifts]
+    drifts = [[value, error if np.isfinite(error) else -1.0] for value, error in calibration.drifts]
+    write_calibration(path, asdict(calibration) | {"drifts": drifts})
+
+
+def write_calibration(path: Path, told: dict) -> None:
+    """Write what a calibration tells, with its ``errors`` those of RigErrors, as JSON, or TOML if the file's name ends so, atomically."""
+    head = {"format": FORMAT, "version": VERSION, **told}
     if Path(path).suffix == ".toml":
         import tomli_w
 
@@ -413,6 +442,16 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
 def load_errors(path: Path) -> RigErrors:
     """The errors of a rig from a calibration file. Raises StrandscopeError, naming file and field, for one that is damaged."""
     path = Path(path)
+    errors = read_calibration(path).get("errors")
+    if not isinstance(errors, dict):
+        raise StrandscopeError(f"{path}: errors is missing; expected a table of the rig's errors")
+    told = {name: errors.get(name, default if name in TOLD_BY_TARGETS else None) for name, default in asdict(RigErrors()).items()}
+    return RigErrors(**{name: _checked(path, f"errors.{name}", told[name], default) for name, default in asdict(RigErrors()).items()})
+
+
+def read_calibration(path: Path) -> dict:
+    """What a calibration file holds. Raises StrandscopeError where it is none."""
+    path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
         head = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
@@ -422,10 +461,24 @@ def load_errors(path: Path) -> RigErrors:
         raise StrandscopeError(f"{path}: not a calibration: {error}") from error
     if not isinstance(head, dict) or head.get("format") != FORMAT or head.get("version") != VERSION:
         raise StrandscopeError(f'{path}: not a calibration; expected "format": "{FORMAT}", "version": {VERSION}')
-    errors = head.get("errors")
-    if not isinstance(errors, dict):
-        raise StrandscopeError(f"{path}: errors is missing; expected a table of the rig's errors")
-    return RigErrors(**{name: _checked(path, f"errors.{name}", errors.get(name), default) for name, default in asdict(RigErrors()).items()})
+    return head
+
+
+def calibrated(path: Path, capture: Capture) -> Capture:
+    """``capture`` as the rig of a calibration file truly took it.
+
+    Errors are true minus stated: a calibration that says for which stated optics it was made, as one from a printed target does, holds
+    for captures that state the same. Raises StrandscopeError for others, and for a file that is damaged.
+    """
+    errors, stated = load_errors(path), read_calibration(path).get("stated")
+    for name, value in (stated if isinstance(stated, dict) else {}).items():
+        own = getattr(capture.optics, name, None)
+        if isinstance(own, float) and name not in OF_THE_FRAME and abs(own - _checked(path, f"stated.{name}", value, 0.0)) > 1e-6 * abs(own):
+            raise StrandscopeError(
+                f"{path}: was made for a rig stated with {name} {value:g}; {capture.folder} states {own:g}: import or capture it with the optics "
+                "that the target was photographed with, or leave --calibration away if it was captured with the calibration already"
+            )
+    return errors.corrected(capture)
 
 
 def _checked(path: Path, name: str, value, default):

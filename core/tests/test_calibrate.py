@@ -319,6 +319,36 @@ def test_corrections_are_true_minus_stated():
     assert rig.gains == {"a0": 0.99, "b0": 1.01, "a1": 1.0, "b1": 1.0}
 
 
+def test_a_file_from_before_targets_has_no_distortion(tmp_path):
+    save_calibration(tmp_path / "rig.json", a_calibration())
+    head = json.loads((tmp_path / "rig.json").read_text())
+    head["errors"] = {name: value for name, value in head["errors"].items() if name not in ("pitch_parts", "travel_deg", "travel_up_deg")}
+    head["errors"].pop("k1_per_mm2")
+    (tmp_path / "rig.json").write_text(json.dumps(head))
+    assert load_errors(tmp_path / "rig.json") == FOUND
+
+
+def test_what_a_target_tells_is_corrected_too():
+    sweeps = tuple(Sweep(30.0 * k, (0.0, 0.2), (f"a{k}", f"b{k}")) for k in range(2))
+    wrong = RigErrors(working_distance_mm=3.3, pitch_parts=0.005, travel_deg=0.2, travel_up_deg=-0.1, k1_per_mm2=2e-6, k2_per_mm4=1e-10)
+    optics = wrong.corrected(Capture(".", "lock", OPTICS, sweeps)).optics
+    assert optics.pitch_mm == pytest.approx(OPTICS.pitch_mm * (1 + 3.3 / OPTICS.working_distance_mm) * 1.005)
+    assert (optics.travel_deg, optics.travel_up_deg, optics.k1_per_mm2, optics.k2_per_mm4) == (0.2, -0.1, 2e-6, 1e-10)
+
+
+def test_a_change_found_later_leaves_what_the_target_told():
+    sweeps = tuple(Sweep(30.0 * k, (0.0, 0.2), (f"a{k}", f"b{k}")) for k in range(2))
+    begun = RigErrors(axis_px=1.0, working_distance_mm=1.0, pitch_parts=0.005, k1_per_mm2=2e-6)
+    change = np.zeros(FIRST_SWEEP + 2)
+    change[0], change[4] = 0.01, 0.001
+    capture = Capture(".", "lock", OPTICS, sweeps)
+    after = begun.plus(change, capture)
+    assert (after.pitch_parts, after.k1_per_mm2) == (0.005, 2e-6)
+    assert after.axis_px == pytest.approx(1.0 + 0.01 / begun.corrected(capture).optics.pitch_mm)
+    pitches = [errors.corrected(capture).optics.pitch_mm for errors in (begun, after)]
+    assert pitches[1] / pitches[0] == pytest.approx(1.001)
+
+
 def test_people_are_told_every_error_and_what_is_none():
     rows = dict(row for row in describe(replace(a_calibration(), errors=replace(FOUND, focus_mm=0.001))) if row)
     assert rows["axis"].startswith("+3.000 ± 0.010 px")
@@ -326,4 +356,8 @@ def test_people_are_told_every_error_and_what_is_none():
     assert "none that is sure" not in rows["working distance"]
     assert rows["step to sweep 1"].startswith("+0.1000 ± 0.0100 °")
     assert rows["gain"].startswith("+2.00 ±")
-    assert len(astuple(FOUND)) == 7
+    assert "pitch" not in rows
+    told = dict(row for row in describe(replace(a_calibration(), errors=replace(FOUND, pitch_parts=0.005, k1_per_mm2=3e-6))) if row)
+    assert told["pitch"].startswith("+0.500 %")
+    assert told["distortion k1"].startswith("+3e-06")
+    assert len(astuple(FOUND)) == 12

@@ -35,7 +35,17 @@ def same_arrays(a, b):
 # ---- an axis that leans ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("tilt", [{"tilt_deg": 0.3}, {"tilt_towards_deg": 0.3}, {"tilt_deg": -0.2, "tilt_towards_deg": 0.2}])
+@pytest.mark.parametrize(
+    "tilt",
+    [
+        {"tilt_deg": 0.3},
+        {"tilt_towards_deg": 0.3},
+        {"tilt_deg": -0.2, "tilt_towards_deg": 0.2},
+        {"k1_per_mm2": 4e-4},  # 2.5 px at the corner
+        {"travel_deg": 0.5, "travel_up_deg": -0.3},
+        {"tilt_deg": 0.3, "k1_per_mm2": -4e-4, "k2_per_mm4": 1e-5, "travel_deg": 0.5},
+    ],
+)
 def test_ridges_set_upright_are_where_an_upright_axis_has_them(tilt):
     """Points around the plane of focus of a rig that leans, seen through the lens; the same points, seen by an upright rig."""
     rng = np.random.default_rng(0)
@@ -44,7 +54,7 @@ def test_ridges_set_upright_are_where_an_upright_axis_has_them(tilt):
     leaning = replace(OPTICS, **tilt)
 
     def seen(optics):
-        (col, row, _), (there, above, _) = pixels(points, 0, d, optics).T, pixels(along, 0, d, optics).T
+        (col, row, _), (there, above, _) = pixels(points, 0, d, optics, SHAPE).T, pixels(along, 0, d, optics, SHAPE).T
         return Ridges(col, row, np.arctan2(row - above, there - col) % np.pi, np.ones(200), np.zeros(200))
 
     found, wanted = upright(seen(leaning), d, leaning, SHAPE), seen(OPTICS)

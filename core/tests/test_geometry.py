@@ -85,6 +85,38 @@ def test_slope_is_how_the_image_moves_with_the_camera(u, v, d):
     assert slope(u, v, 330.0)[2] == 1.0
 
 
+SHAPE = (1462, 2193)
+BENT = replace(OPTICS, travel_deg=0.3, travel_up_deg=-0.2, k1_per_mm2=8e-6, k2_per_mm4=-1e-9)
+
+
+@given(st.floats(0, 2192), st.floats(0, 1461), st.floats(-40, 40))
+def test_what_is_set_right_goes_back_to_where_it_was_photographed(col, row, d):
+    there = geometry.set_right(col, row, d, BENT, SHAPE)
+    assert geometry.as_photographed(*there, d, BENT, SHAPE) == pytest.approx((col, row), abs=1e-5)
+
+
+def test_distortion_by_hand():
+    # 700 px right of the middle: 20 mm, k1 r² = 0.0004: it belongs 0.28 px farther out
+    optics = replace(OPTICS, k1_per_mm2=1e-6)
+    assert geometry.set_right(1096.0 + 700, 730.5, 0.0, optics, SHAPE) == pytest.approx((1096.0 + 700.28, 730.5))
+    assert geometry.set_right(1096.0, 730.5 - 700, 0.0, optics, SHAPE) == pytest.approx((1096.0, 730.5 - 700.28))
+
+
+def test_a_stage_that_leads_the_camera_to_the_right_shows_things_farther_left():
+    aside = replace(OPTICS, travel_deg=np.degrees(np.arctan(0.01)), travel_up_deg=np.degrees(np.arctan(0.02)))
+    point = np.array([[3.0, 1.0, 10.0]])  # in focus at d = 10, where the camera is 0.1 mm to the right and 0.2 mm up: 3.5 px and 7 px
+    seen, ideal = pixels(point, 0.0, 10.0, aside, SHAPE)[0], pixels(point, 0.0, 10.0, OPTICS, SHAPE)[0]
+    np.testing.assert_allclose(seen - ideal, (-3.5, 7.0, 0.0), atol=1e-9)
+    assert geometry.set_right(seen[0], seen[1], 10.0, aside, SHAPE) == pytest.approx(tuple(ideal[:2]))
+
+
+def test_optics_of_reduced_photographs_bend_the_same_light():
+    small = BENT.reduced(3)
+    col, row = geometry.set_right(1900.0, 200.0, 5.0, BENT, SHAPE)
+    less = geometry.set_right((1900.0 - 1) / 3, (200.0 - 1) / 3, 5.0, small, (1462 // 3, 2193 // 3))
+    assert less == pytest.approx(((col - 1) / 3, (row - 1) / 3), abs=0.02)  # the middle is where it was, to half a pixel that was cut off
+
+
 def test_right_is_up_the_columns_and_up_is_down_the_rows():
     assert to_pixel(1.0, 0.0, 1 / 35, 100.0, 50.0) == pytest.approx((135.0, 50.0))
     assert to_pixel(0.0, 1.0, 1 / 35, 100.0, 50.0) == pytest.approx((100.0, 15.0))

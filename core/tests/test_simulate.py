@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from strandscope.core.simulate import (
     SimulateParams,
     aperture_radius_mm,
     aperture_rays,
+    as_photographed,
     board,
     drawing,
     expose,
@@ -434,7 +436,7 @@ def test_the_paper_scale_is_that_of_the_paper():
     assert sum(len(s.files) for s in capture.sweeps) == 9024
     assert (capture.sweeps[0].positions_mm[0], capture.sweeps[0].positions_mm[-1]) == (-37.5, 37.5)
     assert aperture_radius_mm(capture.optics) == pytest.approx(28.87, abs=0.01)
-    assert module.stopped_cone_deg(SimulateParams()) == pytest.approx(1.754, abs=0.001)
+    assert module.stopped_cone_deg(SimulateParams(), 16.0) == pytest.approx(1.754, abs=0.001)
 
 
 def test_the_board_is_blue_and_hair_stands_out_in_red():
@@ -472,6 +474,33 @@ def test_a_misaligned_rig_sees_a_fiber_where_its_true_optics_put_it():
         crest = (line * np.arange(len(line))).sum() / line.sum()
         assert crest == pytest.approx(seen[0], abs=0.3)
     assert abs(pixels(lock.points_mm, capture.sweeps[9].angle_deg, 0.0, OPTICS) - place)[:, 0].max() > 2
+
+
+def test_a_lens_that_distorts_and_a_stage_that_leads_aside_move_the_photograph():
+    """A fiber near the right edge, photographed at d = 3: its crest lies where the geometry says, 3 px off where a straight rig has it."""
+    bent = replace(OPTICS, travel_deg=-0.8, travel_up_deg=0.2, k1_per_mm2=-2e-3)
+    lock = fibers(((2.6, -4, 3.0), (2.6, 4, 3.0)))
+    straight = flat(lock, 0.0)
+    drawn = as_photographed(straight, bent, 3.0, SHAPE)
+    assert as_photographed(straight, OPTICS, 3.0, SHAPE) is straight
+    red = take(drawn, 3.0)[0]
+    place = pixels(lock.points_mm, 0.0, 3.0, bent, SHAPE)
+    for row in (15, SHAPE[0] // 2, SHAPE[0] - 15):
+        seen = place[np.argmin(np.abs(place[:, 1] - row))]
+        line = red[round(seen[1])]
+        assert (line * np.arange(len(line))).sum() / line.sum() == pytest.approx(seen[0], abs=0.1)
+    assert np.abs(pixels(lock.points_mm, 0.0, 3.0, OPTICS) - place)[:, 0].max() > 2
+
+
+def test_a_simulation_from_before_there_were_as_many_errors_is_kept(tmp_path, done):
+    old = tmp_path / "old"
+    shutil.copytree(done, old)
+    asked = json.loads((old / module.JOURNAL).read_text())
+    del asked["misalignment"]["k1_per_mm2"], asked["misalignment"]["pitch_parts"]
+    (old / module.JOURNAL).write_text(json.dumps(asked))
+    before = (old / "capture.json").stat().st_mtime_ns
+    simulate(old, PARAMS, workers=2)
+    assert (old / "capture.json").stat().st_mtime_ns == before
 
 
 def test_stated_and_true_rig_differ_in_the_photographs_alone(tmp_path, done):
