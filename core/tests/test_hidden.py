@@ -148,65 +148,106 @@ def test_more_is_found_where_more_angles_see():
 
 # ---- hidden ----------------------------------------------------------------------------------------------------------
 
+DARK, OPEN = np.zeros(GRID.shape, np.float32), np.ones(GRID.shape, np.float32)  # shares of the rays that pass
+BODY = cylinder(per_mm2=1.0)
 
-def looked_at(true, body=None):
+
+def rays_through(*layers):
+    """Rays of what is found that pass each voxel, as a share of those in the open, in closed form. layers: (radius, fibers per mm²) of
+    cylinders that add up. An angle finds hair at an optical depth t as ``sees`` tells, so that of a depth from t on as much is found as the
+    integral of that over t."""
+    depths = np.linspace(0, 20, 4001)
+    found = np.r_[0.0, np.cumsum(sees(np.exp(-0.5 * (depths[1:] + depths[:-1]))) * np.diff(depths))]
+    total = np.zeros(GRID.shape)
+    for theta in np.radians(ANGLES):
+        u = centres()[..., 0] * np.cos(theta) + centres()[..., 2] * np.sin(theta)
+        w = -centres()[..., 0] * np.sin(theta) + centres()[..., 2] * np.cos(theta)
+        here, behind = np.zeros(GRID.shape), np.zeros(GRID.shape)
+        for radius_mm, per_mm2 in layers:
+            half = np.sqrt(np.maximum(radius_mm**2 - u**2, 0))
+            here += per_mm2 * DIAMETER * np.clip(half - w, 0, 2 * half)
+            behind += per_mm2 * DIAMETER * 2 * half
+        total += np.interp(behind, depths, found) - np.interp(here, depths, found)
+    air = total[layers[0][0] + 0.5 < RADIUS]
+    return (total / np.median(air[air > 0])).astype(np.float32)
+
+
+def looked_at(true, through, body=BODY):
     """What was found of known hair, if the cameras see as ``seen_from`` tells: the found density, the estimate of what was not."""
     seen = seen_from(true, DIAMETER, GRID, ANGLES)
     found = true * found_share(seen)
     points = np.flatnonzero(np.random.default_rng(3).random(true.size) < 0.1 * found.ravel() / found.max())
-    body = cylinder(per_mm2=1.0) if body is None else body
     at = centres().reshape(-1, 3)[points]
-    return found, hidden(found, body, DIAMETER, GRID, ANGLES, at, seen.ravel()[points] / EVIDENCE)
+    return found, hidden(found, body, through, DIAMETER, GRID, ANGLES, at, seen.ravel()[points] / EVIDENCE)
 
 
 @pytest.mark.parametrize("per_mm2", [4.0, 6.0, 8.0])
-def test_a_hidden_core_as_dense_as_its_shell_is_found(per_mm2):
+def test_a_dark_body_as_dense_within_as_without_is_made_whole(per_mm2):
     true = cylinder(per_mm2=per_mm2)
-    found, estimate = looked_at(true)
-    wanted = true - found
-    assert wanted.sum() > 0.04 * true.sum()
-    assert estimate.missing.sum() == pytest.approx(wanted.sum(), rel=0.12)
-    assert np.corrcoef(estimate.missing.ravel(), wanted.ravel())[0, 1] > 0.99
+    found, estimate = looked_at(true, DARK)
+    assert (found + estimate.missing).sum() == pytest.approx(true.sum(), rel=0.1)
+    assert found.sum() < 0.97 * true.sum()
+    core = RADIUS < 1.5
+    assert estimate.missing[core].mean() == pytest.approx((true - found)[core].mean(), rel=0.2)
     assert estimate.missing.dtype == estimate.found.dtype == np.float32
-    assert np.abs(estimate.found - found_share(seen_from(true, DIAMETER, GRID, ANGLES)))[RADIUS < 3.5].max() < 0.1
-    assert estimate.missing[RADIUS > 4.2].max() == 0.0  # there is no body
+    assert np.abs(estimate.found - found_share(seen_from(true, DIAMETER, GRID, ANGLES)))[RADIUS < 3.5].max() < 0.12
+    assert estimate.missing[RADIUS > 4.3].max() == 0.0  # there is no body
+
+
+FOURFOLD = pytest.mark.xfail(strict=True, reason="where no share hides the points enough, the largest is taken: 4 times a full inside")
+
+
+@pytest.mark.parametrize("per_mm2", [4.0, pytest.param(6.0, marks=FOURFOLD), pytest.param(8.0, marks=FOURFOLD)])
+def test_hair_that_its_own_rays_tell_of_is_made_whole(per_mm2):
+    true = cylinder(per_mm2=per_mm2)
+    found, estimate = looked_at(true, rays_through((4.0, per_mm2)))
+    assert (found + estimate.missing).sum() == pytest.approx(true.sum(), rel=0.1)
+    assert (found + estimate.missing).max() < 1.5 * per_mm2
 
 
 def test_a_denser_core_hides_more():
-    cores = [looked_at(cylinder(core_mm=2.0, core_per_mm2=core))[1].missing[RADIUS < 2].mean() for core in (0.5, 5.0, 9.0)]
-    assert np.all(np.diff(cores) > 0.2)
+    cores = []
+    for core in (0.5, 5.0, 9.0):
+        estimate = looked_at(cylinder(core_mm=2.0, core_per_mm2=core), rays_through((4.0, 6.0), (2.0, core - 6.0)))[1]
+        cores.append(estimate.missing[RADIUS < 1.5].mean())
+    assert cores[0] < 0.1
+    assert cores[0] < cores[1] < cores[2]
 
 
-def test_of_thin_hair_nothing_is_missing():
-    true = cylinder(per_mm2=2.0)  # at least 14 of 24 angles see its middle
-    assert looked_at(true)[1].missing.sum() < 0.01 * true.sum()
+def test_hair_that_rays_pass_is_not_missing():
+    true = cylinder(per_mm2=6.0)
+    assert looked_at(true, OPEN)[1].missing.sum() == 0.0
+    thin = cylinder(per_mm2=2.0)  # at least 14 of 24 angles see its middle
+    assert looked_at(thin, rays_through((4.0, 2.0)))[1].missing.sum() < 0.01 * thin.sum()
+    hollow = cylinder(core_mm=2.0)
+    assert looked_at(hollow, rays_through((4.0, 6.0), (2.0, -6.0)))[1].missing.sum() < 0.02 * hollow.sum()
 
 
-def test_where_the_found_hair_hides_as_much_as_was_observed_nothing_is_missing():
-    ring = cylinder(core_mm=2.0, core_per_mm2=0.0)
-    at = centres()[(RADIUS > 2) & (RADIUS < 4)]
-    seen = seen_from(ring, DIAMETER, GRID, ANGLES)[(RADIUS > 2) & (RADIUS < 4)]
-    estimate = hidden(ring, cylinder(per_mm2=1.0), DIAMETER, GRID, ANGLES, at, seen / EVIDENCE, view_blur_mm=0.01)
-    assert estimate.missing.sum() < 0.01 * ring.sum()
+def test_a_core_without_any_found_hair_that_is_dark_is_as_dense_as_the_shell():
+    ring = cylinder(core_mm=2.0)
+    estimate = hidden(ring, BODY, np.where(RADIUS < 2, 0, 1), DIAMETER, GRID, ANGLES, np.empty((0, 3)), np.empty(0))
+    assert estimate.missing[RADIUS < 1.2].mean() == pytest.approx(6.0, rel=0.05)
+    assert estimate.missing[RADIUS > 2.8].max() < 0.05
 
 
-def test_without_places_that_tell_nothing_is_made_up():
+def test_in_the_light_nothing_is_made_up_whatever_the_evidence():
     true = cylinder()
     nowhere = centres()[(RADIUS > 4.8)]
     for at, evidence in ((nowhere, np.full(len(nowhere), 12.0)), (centres().reshape(-1, 3), np.zeros(true.size)), (np.empty((0, 3)), np.empty(0))):
-        estimate = hidden(true, cylinder(per_mm2=1.0), DIAMETER, GRID, ANGLES, at, evidence)
+        estimate = hidden(true, BODY, OPEN, DIAMETER, GRID, ANGLES, at, evidence)
         assert not estimate.missing.any()
-        assert estimate.found.shape == GRID.shape
+        assert estimate.found == pytest.approx(found_share(seen_from(true, DIAMETER, GRID, ANGLES)), abs=0.15)
 
 
 def test_no_body_no_hidden_hair():
-    estimate = looked_at(cylinder(), body=np.zeros(GRID.shape, np.float32))[1]
-    assert not estimate.missing.any()
+    assert not looked_at(cylinder(), DARK, body=DARK)[1].missing.any()
 
 
 def test_volumes_of_another_shape_are_an_error_in_words():
-    good = cylinder()
+    good, points = cylinder(), (np.zeros((1, 3)), np.ones(1))
     with pytest.raises(StrandscopeError, match="the density has shape"):
         seen_from(good[1:], DIAMETER, GRID, ANGLES)
     with pytest.raises(StrandscopeError, match="the body has shape"):
-        hidden(good, good[:, 1:], DIAMETER, GRID, ANGLES, np.zeros((1, 3)), np.ones(1))
+        hidden(good, good[:, 1:], OPEN, DIAMETER, GRID, ANGLES, *points)
+    with pytest.raises(StrandscopeError, match="the share of rays has shape"):
+        hidden(good, good, OPEN[1:], DIAMETER, GRID, ANGLES, *points)

@@ -108,7 +108,7 @@ def test_bends_without_curves_that_tell_are_slight(curves):
 # ---- links -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("gap_mm", "share"), [(1.0, 0.9), (2.0, 0.7), (4.0, 0.3)])
+@pytest.mark.parametrize(("gap_mm", "share"), [(1.0, 0.95), (2.0, 0.9), (4.0, 0.75)])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_pieces_of_one_fiber_are_linked(gap_mm, share, seed):
     pieces, stops, truth = cut_lock(gap_mm, seed=seed)
@@ -175,7 +175,7 @@ def test_hair_of_different_locks_is_not_linked():
     points, _ = flat(mixed)
     for link in links:
         a, b = (mixed[end // 2][-1 if end % 2 else 0] for end in link.ends)
-        assert np.linalg.norm((a - b)[[0, 2]]) < 1.0  # of hair that leans by 0.2 a mm
+        assert np.linalg.norm((a - b)[[0, 2]]) < 0.5 * abs(a[1] - b[1])  # of hair that leans by 0.2 or so
     assert len(links) <= 2
     assert len(left) + 2 * len(links) == len(mixed)
     assert np.ptp(points[:, 0]) > 9
