@@ -11,6 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from strandscope.core.advection import captured_density
+from strandscope.core.apart import ApartParams
 from strandscope.core.errors import StrandscopeError
 from strandscope.core.hidden import EVIDENCE, found_share, seen_from
 from strandscope.core.hull import Grid
@@ -288,6 +289,17 @@ def test_gaps_are_closed_and_both_sides_are_one_fiber(kind, points):
     assert np.abs(crossings(*together(captured, filled)) / len(full) - 1).max() < 0.1
 
 
+@pytest.mark.xfail(strict=True, reason="what is linked with nothing between is not told by the joins")
+def test_pieces_that_run_past_each_other_are_one_fiber():
+    full, pieces, stops = straight(30), [], []
+    for k, curve in enumerate(full):
+        pieces += [curve[:30], curve[28:] + np.array([0.01, 0.0, 0.0])] if k < 6 else [curve]
+        stops += [[LEFT, OPEN], [OPEN, LEFT]] if k < 6 else [[LEFT, LEFT]]
+    captured = told(pieces, stops, full)
+    fiber = fiber_of(captured, fill(captured))
+    assert sum(fiber[2 * k] == fiber[2 * k + 1] for k in range(6)) >= 5
+
+
 # ---- whole hidden fibers ---------------------------------------------------------------------------------------------
 
 
@@ -345,14 +357,18 @@ def test_radii_are_those_of_the_fiber_or_of_captured_ones():
 
 
 def test_the_same_seed_gives_the_same_strands_on_any_number_of_threads():
-    captured = cut_short(wavy())
-    one, again = fill(captured, count=5), fill(captured, count=5)
+    captured = cut_short(wavy(30))
+
+    def few(seed=0):  # of all that threads wait for each other in
+        params = InfillParams(count=5, seed=seed, apart=ApartParams(rounds=40, smooth_rounds=20))
+        return infill(captured, INSIDE, OPEN_TO_LIGHT, GRID, ANGLES[::8], params)
+
+    one, again, other = few(), few(), few(seed=1)
     numba.set_num_threads(min(2, numba.config.NUMBA_NUM_THREADS))
-    two = fill(captured, count=5)
+    two = few()
     numba.set_num_threads(1)
     for a, b, c in zip(one, again, two, strict=True):
         assert a.tobytes() == b.tobytes() == c.tobytes()
-    other = fill(captured, count=5, seed=1)
     assert len(other.offsets) == len(one.offsets)
     assert other.points_mm.tobytes() != one.points_mm.tobytes()
 

@@ -218,6 +218,18 @@ def test_errors_that_are_not_known_do_not_stop_a_link():
     assert all(np.isfinite([link.score, link.length_mm]).all() for link in links)
 
 
+@pytest.mark.parametrize("past_mm", [0.1, 0.3, 0.6])
+def test_ends_that_run_past_each_other_are_linked_by_nothing_between(past_mm):
+    line = np.arange(0, 8, STEP)[:, None] * [0.0, 1.0, 0.0]
+    pieces = [line, line + np.array([0.01, line[-1, 1] - past_mm, 0.0])]
+    (link,), left = linked(pieces, [[LEFT, OPEN], [OPEN, LEFT]])
+    assert tuple(sorted(link.ends)) == (1, 2)
+    assert link.length_mm == pytest.approx(-past_mm, abs=0.1)
+    assert len(left) == 0
+    _, new = joined(pieces, replace_link(link))
+    assert new.stop == new.start
+
+
 def test_no_link_is_longer_than_allowed():
     y = np.arange(0, 8, STEP)[:, None] * [0.0, 1.0, 0.0]
     pieces, stops = [y, y + np.array([0.0, 9.8, 0])], [[LEFT, OPEN], [OPEN, LEFT]]
