@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from strandscope.core.advection import captured_density
+from strandscope.core.advection import AdvectionParams, captured_density
 from strandscope.core.apart import ApartParams
 from strandscope.core.errors import StrandscopeError
 from strandscope.core.hidden import EVIDENCE, found_share, seen_from
@@ -360,7 +360,7 @@ def test_the_same_seed_gives_the_same_strands_on_any_number_of_threads():
     captured = cut_short(wavy(30))
 
     def few(seed=0):  # of all that threads wait for each other in
-        params = InfillParams(count=5, seed=seed, apart=ApartParams(rounds=40, smooth_rounds=20))
+        params = InfillParams(count=5, seed=seed, apart=ApartParams(rounds=10, smooth_rounds=5), advection=AdvectionParams(cycles=1))
         return infill(captured, INSIDE, OPEN_TO_LIGHT, GRID, ANGLES[::8], params)
 
     one, again, other = few(), few(), few(seed=1)

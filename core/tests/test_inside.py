@@ -89,12 +89,20 @@ def test_a_core_that_cameras_see_into_is_hollow():
     assert distance[RADIUS < 1.5].max() < 0.0
 
 
-def test_air_near_the_bounds_is_air():
-    hair, bounds = ring(1.0, 2.0, 36.0), within(4.5)
+def test_a_volume_that_is_too_wide_is_not_hair_where_cameras_see():
+    distance = surface(ring(1.0, 2.0, 36.0), within(4.5))
+    assert distance[(RADIUS > 2.8) & (RADIUS < 4.5)].max() < 0.0
+
+
+def test_near_the_bounds_is_air_even_where_no_camera_sees():
+    hair, bounds = ring(2.8, 3.5, 36.0), within(4.0) - within(1.0)  # a hole that the volume tells of, and that no camera sees into
+    near, deep = (RADIUS > 1.15) & (RADIUS < 1.6), (RADIUS > 2.0) & (RADIUS < 3.5)
     distance = surface(hair, bounds, params=InsideParams(air_mm=0.8))
-    assert distance[(RADIUS > 4.5 - 0.8)].max() < 0.0
-    seen_into = (RADIUS > 2.8) & (RADIUS < 4.5)
-    assert distance[seen_into].max() < 0.0  # a volume too wide, as hull and carving leave it, is not hair where cameras see
+    assert distance[near].max() < 0.0
+    assert distance[deep].min() > 0.0
+    trusted = surface(hair, bounds, params=InsideParams(air_mm=0.0))
+    assert trusted[near].min() > 0.0
+    assert trusted[RADIUS < 0.8].max() < 0.0
 
 
 def test_the_volume_goes_on_beyond_the_ends_of_the_grid():
