@@ -13,6 +13,9 @@ from numba import njit, prange
 from .groom import closest
 
 
+_HELD = 0.3  # of a free point's way, below which a point near an end that is held is not pushed
+
+
 @dataclass(frozen=True)
 class ApartParams:
     """Parameters of the pushing apart. Lengths in mm."""
@@ -75,7 +78,7 @@ def _yielding(points, offsets, held, held_mm):
             arc = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points[part], axis=0), axis=1))]
             for is_held, away in ((one, arc), (other, arc[-1] - arc)):
                 if is_held:
-                    free[part] *= 1.0 - np.exp(-((away + 0.5 * held_mm) ** 2) / (2 * held_mm**2))
+                    free[part] *= 1.0 - np.exp(-(away**2) / (2 * held_mm**2))
     return free
 
 
@@ -148,8 +151,12 @@ def _pushes(points, radii, near, starts, first, ours, clearance, out):
             j = near[m]
             s, _, x, y, z = closest(points, i, j)
             square, needed = x * x + y * y + z * z, radii[i] + radii[j] + clearance
-            if square >= needed * needed or square < 1e-12:
+            if square >= needed * needed:
                 continue
+            if square < 1e-12:  # they meet: any way across both parts them, the same for both but for its sign
+                x, y, z = _across_both(points, min(i, j), max(i, j))
+                turn = 1e-6 if i < j else -1e-6
+                x, y, z, square = turn * x, turn * y, turn * z, 1e-12
             distance = np.sqrt(square)
             push = (needed - distance) / distance * (0.5 if j < ours else 1.0)
             for at, share in ((0, 1.0 - s), (4, s)):
@@ -157,6 +164,17 @@ def _pushes(points, radii, near, starts, first, ours, clearance, out):
                 out[n, at + 1] += share * push * y
                 out[n, at + 2] += share * push * z
                 out[n, at + 3] += share
+
+
+@njit(cache=True, nogil=True)
+def _across_both(points, i, j):
+    """A unit vector at right angles to segments i and j."""
+    a, b = points[i + 1] - points[i], points[j + 1] - points[j]
+    c = np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    if np.sum(c * c) < 1e-8 * np.sum(a * a) * np.sum(b * b):  # parallel
+        c = np.array([-a[1], a[0], 0.0]) if abs(a[2]) < 0.9 * np.sqrt(np.sum(a * a)) else np.array([0.0, -a[2], a[1]])
+    c /= np.sqrt(np.sum(c * c))
+    return c[0], c[1], c[2]
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -169,6 +187,8 @@ def _make_way(points, offsets, first_of, pushes, kernel, free):
         push, pushed = np.zeros((size, 3)), np.zeros(size)
         some = False
         for n in range(size):
+            if free[low + n] < _HELD:  # what it could make way by is too little: its neighbours would be pushed for ever
+                continue
             weight = 0.0
             for side in range(2):
                 segment = n - side

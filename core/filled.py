@@ -58,7 +58,7 @@ def fill_score(strands: Strands, truth: Truth, seed: int = 0) -> dict:
         "infill_inside_wide": float(np.mean(distance <= 2 * HULL_MM)) if len(angle) else 1.0,
     }
     report |= _overlapping(strands, lines, fill, within)
-    return report | _told_apart(strands, truth, lines, true, inside, seed)
+    return report | _told_apart(strands, lines, true, inside, seed)
 
 
 def _crossings(lines, true, inside, height):
@@ -116,7 +116,7 @@ def _neighbours(points, tangents, group, lines, groups, reach_mm):
 # ---- told apart ------------------------------------------------------------------------------------------------------
 
 
-def _told_apart(strands, truth, lines, true, inside, seed):
+def _told_apart(strands, lines, true, inside, seed):
     captured = strands.captured
     fine = _lines(captured.points_mm, captured.offsets, TRUTH_MM)
     hidden = (_nearest(fine, true.points)[0] > FOUND_MM) & inside(true.points)

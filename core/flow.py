@@ -116,7 +116,8 @@ def across(fx, fy, fz, ax, ay, az):
     ax, ay, az = ax - along * fx, ay - along * fy, az - along * fz
     length = np.sqrt(ax * ax + ay * ay + az * az)
     if length < 1e-6:  # it lay along the way: any other will do
-        return (1.0 - fx * fx, -fx * fy, -fx * fz) if abs(fx) < 0.7 else (-fx * fy, 1.0 - fy * fy, -fy * fz)
+        ax, ay, az = (1.0 - fx * fx, -fx * fy, -fx * fz) if abs(fx) < 0.7 else (-fx * fy, 1.0 - fy * fy, -fy * fz)
+        length = np.sqrt(ax * ax + ay * ay + az * az)
     return ax / length, ay / length, az / length
 
 

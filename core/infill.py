@@ -163,7 +163,7 @@ def _roughness(curves, step_mm):
 def _checked(captured, distance_mm, grid):
     """Contiguous points (N, 3) float64, offsets (M + 1,) int64, mean radius (M,) of each curve."""
     points, offsets = np.ascontiguousarray(captured.points_mm, np.float64), np.ascontiguousarray(captured.offsets, np.int64)
-    if points.ndim != 2 or points.shape[1:] != (3,) or len(offsets) < 2 or offsets[-1] != len(points) or np.any(np.diff(offsets) < 2):
+    if points.ndim != 2 or points.shape[1:] != (3,) or len(offsets) < 2 or offsets[0] != 0 or offsets[-1] != len(points) or np.any(np.diff(offsets) < 2):
         raise StrandscopeError(
             f"infill: no captured curves (points {points.shape}, offsets {offsets.shape}); expected some, of 2 points or more each"
         )
@@ -504,17 +504,17 @@ def _field_at(streams, x, y, z):
 
 
 def _gathered(strands, from_ends, points, offsets, radii, params) -> Infill:
-    """The strands pushed apart, without those of no points, and their joins."""
+    """The strands pushed apart, without those of fewer than two points, and all joins: of ends that a strand links, or that meet."""
     count = len(offsets) - 1
+    meeting = [ends for strand, ends in zip(strands, from_ends, strict=True) if len(strand) < 2 and min(ends) >= 0]
     keep = [k for k, strand in enumerate(strands) if len(strand) >= 2]
     strands, from_ends = [strands[k] for k in keep], [from_ends[k] for k in keep]
     radius = np.array([_radius(ends, radii, params.seed, k) for k, ends in enumerate(from_ends)])
     sizes = np.array([len(strand) for strand in strands], np.int64)
     starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     together = np.concatenate(strands) if strands else np.empty((0, 3))
-    joins = np.array(
-        [(end, 2 * (count + k) + side) for k, ends in enumerate(from_ends) for side, end in enumerate(ends) if end >= 0], np.int64
-    ).reshape(-1, 2)
+    joined = [(end, 2 * (count + k) + side) for k, ends in enumerate(from_ends) for side, end in enumerate(ends) if end >= 0]
+    joins = np.array(joined + meeting, np.int64).reshape(-1, 2)
     fiber = _fibers(joins, count + len(strands))
     moving, still = Tubes(together, starts, radius, fiber[count:]), Tubes(points, offsets, radii, fiber[:count])
     held = np.array([[end >= 0 for end in ends] for ends in from_ends], bool).reshape(-1, 2)

@@ -46,7 +46,7 @@ class Link(NamedTuple):
 
 
 FIT = 3  # points either side that curvature is fitted to
-FIRST_MM, LAST_MM = 0.6, 10.0  # lags at which its autocovariance is read: nearer, the errors of points tell too
+FIRST_MM, LAST_MM = 1.4, 10.0  # lags at which its autocovariance is read: nearer, the same points' errors tell twice
 _KEPT_MM = (0.5, 20.0)
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 _BACK = np.array([1.0, -1.0, 1.0])  # a state seen the other way: the direction turns round
@@ -117,7 +117,9 @@ def find_links(
     states = [_state(*_sure(*_leading(points, error_mm, offsets, end), params), wander, params) for end in open_ends]
     mean, spread = np.stack([s[0] for s in states]), np.stack([s[1] for s in states])
     one, other = _candidates(mean, open_ends, params)
-    score, length = _scores(mean, spread, one, other, wander, _crowd(mean[:, 0]), params)
+    crowd = _crowd(mean[:, 0])
+    both = [_scores(mean, spread, *way, wander, crowd, params) for way in ((one, other), (other, one))]
+    score, length = (0.5 * (a + b) for a, b in zip(*both, strict=True))
     tips = np.stack([_leading(points, error_mm, offsets, end)[0][-1] for end in open_ends])
     length -= np.sum((tips[one] - mean[one, 0]) * mean[one, 1], axis=1) + np.sum((tips[other] - mean[other, 0]) * mean[other, 1], axis=1)
     links, used = [], np.zeros(len(open_ends), bool)

@@ -110,7 +110,6 @@ def test_a_strand_makes_all_the_way_for_one_that_stands_still():
     [line((0, 0, 0), (0.6, 0.8, 0)), line((0.013, 0.05, 0), (0.6, 0.8, 0)), line((0, 0, 0))],
     ids=["at a point", "inside segments", "all along"],
 )
-@pytest.mark.xfail(strict=True, reason="strands that meet exactly are not pushed: there is no direction from one to the other")
 def test_strands_that_meet_exactly_make_way_too(other):
     moving = tubes([line((0, 0, 0)), other])
     assert room(pushed(moving), moving) > 0
@@ -199,7 +198,6 @@ def test_nothing_to_move():
 # ---- ends that are held ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.xfail(strict=True, reason="a held end moves by 12 % of each push, in every round, until it is as far as a free one")
 def test_held_ends_keep_their_place():
     moving = tubes([line((0, 0, 0)), line((0, 0, 0.02))])
     after = pushed(moving, held=[[True, True], [True, False]])

@@ -76,7 +76,7 @@ def test_how_curvature_wanders_is_measured(spread, kept_mm):
     [
         0.001,
         0.002,
-        pytest.param(0.008, marks=pytest.mark.xfail(strict=True, reason="the parabolas at lag FIRST_MM overlap: errors of points count there")),
+        0.008,
     ],
 )
 def test_errors_of_points_do_not_count_as_bends(noise_mm):
@@ -128,7 +128,7 @@ def test_each_end_is_used_once_and_the_surest_links_come_first():
     scores = [link.score for link in links]
     assert scores == sorted(scores, reverse=True)
     assert scores[-1] >= -6.0
-    stricter, _ = linked(pieces, stops, LinkParams(least_score=3.0))
+    stricter, _ = linked(pieces, stops, LinkParams(least_score=scores[len(scores) // 2]))
     assert 0 < len(stricter) < len(links)
     assert ends_of(stricter) <= ends_of(links)
 
@@ -140,10 +140,7 @@ def test_the_length_of_a_link_is_that_of_the_gap():
     assert np.abs(np.array(lengths) - 2.0).max() < 0.2
 
 
-ORDER = pytest.mark.xfail(strict=True, reason="a pair is scored from its end of lower number on; from the other end the score is another")
-
-
-@pytest.mark.parametrize("shuffle", [False, pytest.param(True, marks=ORDER)])
+@pytest.mark.parametrize("shuffle", [False, True])
 def test_neither_order_nor_direction_of_curves_matter(shuffle):
     pieces, stops, _ = cut_lock(2.0)
     rng = np.random.default_rng(4)
