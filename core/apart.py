@@ -12,7 +12,6 @@ from numba import njit, prange
 
 from .groom import closest
 
-
 _HELD = 0.3  # of a free point's way, below which a point near an end that is held is not pushed
 
 
@@ -25,7 +24,7 @@ class ApartParams:
     along_mm: float = 0.6  # standard deviation of the length of strand that makes way
     smooth_rounds: int = 200  # in which what was pushed is smoothed along the strand, less and less
     smoothing: float = 0.3  # share by which a point's way is drawn to the mean of its neighbours' at first
-    held_mm: float = 0.3  # from an end that is held, a strand can make way no sooner than after about this
+    held_mm: float = 0.2  # from an end that is held, a strand can make way no sooner than after about this
     settled_mm: float = 2e-5  # a round that moves no point by more is the last
     skin_mm: float = 0.1  # neighbours are looked for this much farther off, so that they serve for some rounds
 

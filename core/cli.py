@@ -791,17 +791,24 @@ def score(session, strands, truth, tolerance_mm, json_file):
     """Compare reconstructed hairs with the hairs that are known to be there.
 
     STRANDS is a strands file, TRUTH the truth.npz of a simulated capture. Recall: how much of the visible hair was found.
-    Precision: how much of what was found is hair. Hairs that were added inside (infill) are left out.
+    Precision: how much of what was found is hair. Hairs that were added inside (infill) are left out of these, and told
+    beside the hidden hairs in rows of their own.
 
     \b
     Example:
       strandscope score out/strands.npz lock/truth.npz
     """
     from .compare import load_truth, score, summary
-    from .strands import load_strands
+    from .filled import fill_score, fill_summary
+    from .strands import INFILL, load_strands
 
-    report = score(load_strands(strands), load_truth(truth), tolerance_mm)
-    _hand_over(session, report, terminal.table(summary(report)), json_file)
+    hair, known = load_strands(strands), load_truth(truth)
+    report = score(hair, known, tolerance_mm)
+    rows = summary(report)
+    if (hair.kind == INFILL).any():
+        report["infill"] = fill_score(hair, known)
+        rows += [None, *fill_summary(report["infill"])]
+    _hand_over(session, report, terminal.table(rows), json_file)
 
 
 @main_group.command(short_help="Measure the methods on simulated locks, in one table.")

@@ -61,6 +61,28 @@ def fill_score(strands: Strands, truth: Truth, seed: int = 0) -> dict:
     return report | _told_apart(strands, lines, true, inside, seed)
 
 
+def fill_summary(report: dict) -> list[tuple[str, str]]:
+    """The figures of a ``fill_score`` as rows (name, value with its meaning) for people."""
+    crossing, angle = report["crossings"], report["infill_direction_deg"]
+    told = report["told_apart"]
+    apart = "not known: pip install scikit-learn, and ten pieces of each" if told is None else f"{told:.3f} right (0.5 is by chance)"
+    return [
+        ("infill", f"{report['infill_mm']:.0f} mm beside {report['captured_mm']:.0f} mm captured; {report['true_mm']:.0f} mm are there"),
+        (
+            "crossing a plane",
+            f"{crossing['ratio']:.3f} of the {crossing['true']:.0f} there are (least {crossing['least']:.2f}, most {crossing['most']:.2f})",
+        ),
+        ("density", f"{report['density_correlation']:.3f} correlation with what is there, in cubes of {DENSITY_MM:g} mm"),
+        ("infill's direction", f"{angle['mean']:.1f}° off the nearest hair (median {angle['median']:.1f})" if angle else "-"),
+        (
+            "infill inside",
+            f"{report['infill_inside']:.4f} within {HULL_MM:g} mm of a hair, {report['infill_inside_wide']:.4f} within {2 * HULL_MM:g}",
+        ),
+        ("infill in other hair", f"{report['overlapping_infill']:.4f} of its length; of all length {report['overlapping_all']:.4f}"),
+        ("infill told from hair", f"{apart}, {report['pieces']} pieces and {report['hidden_pieces']} hidden ones"),
+    ]
+
+
 def _crossings(lines, true, inside, height):
     planes = np.linspace(-0.95 * height, 0.95 * height, PLANES)
     counts = []

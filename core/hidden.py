@@ -21,7 +21,7 @@ FULL = 0.75  # quantile of the density where hair was found: hair that is whole
 DARK, DARKEST = 0.1, 0.05  # share of the rays in the open: where fewer pass, hair is in the way; where far fewer, it is hair that nobody sees
 HALF_SEEN = (1.5, 5.0)  # captured places that so many angles should see tell by how many did what else is in the way
 EVIDENCE = 0.85  # angles that see a place, for each that has seen a hair there; simulated locks
-SHARES = np.array([0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0])  # of a full inside that are tried; where none explains what is seen, it is full
+SHARES = np.array([0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0])  # of a full inside that are tried; where none explains what is seen, it is full
 
 
 def seen_from(density: np.ndarray, diameter_mm: float, grid: Grid, angles_deg: np.ndarray) -> np.ndarray:

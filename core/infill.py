@@ -163,7 +163,14 @@ def _roughness(curves, step_mm):
 def _checked(captured, distance_mm, grid):
     """Contiguous points (N, 3) float64, offsets (M + 1,) int64, mean radius (M,) of each curve."""
     points, offsets = np.ascontiguousarray(captured.points_mm, np.float64), np.ascontiguousarray(captured.offsets, np.int64)
-    if points.ndim != 2 or points.shape[1:] != (3,) or len(offsets) < 2 or offsets[0] != 0 or offsets[-1] != len(points) or np.any(np.diff(offsets) < 2):
+    if (
+        points.ndim != 2
+        or points.shape[1:] != (3,)
+        or len(offsets) < 2
+        or offsets[0] != 0
+        or offsets[-1] != len(points)
+        or np.any(np.diff(offsets) < 2)
+    ):
         raise StrandscopeError(
             f"infill: no captured curves (points {points.shape}, offsets {offsets.shape}); expected some, of 2 points or more each"
         )
@@ -516,10 +523,24 @@ def _gathered(strands, from_ends, points, offsets, radii, params) -> Infill:
     joined = [(end, 2 * (count + k) + side) for k, ends in enumerate(from_ends) for side, end in enumerate(ends) if end >= 0]
     joins = np.array(joined + meeting, np.int64).reshape(-1, 2)
     fiber = _fibers(joins, count + len(strands))
-    moving, still = Tubes(together, starts, radius, fiber[count:]), Tubes(points, offsets, radii, fiber[:count])
-    held = np.array([[end >= 0 for end in ends] for ends in from_ends], bool).reshape(-1, 2)
-    together = push_apart(moving, still, held, params.apart)
+    together = _pushed(together, starts, radius, fiber, from_ends, points, offsets, radii, params)
     return Infill(together.astype(np.float32), starts, np.repeat(radius, sizes).astype(np.float32), joins)
+
+
+def _pushed(together, starts, radius, fiber, from_ends, points, offsets, radii, params):
+    """The points of the strands after pushing apart; the ends that they go on from are held."""
+    count = len(radii)
+    held = np.array([[end >= 0 for end in ends] for ends in from_ends], bool).reshape(-1, 2)
+    tips = points[[[offsets[end // 2 + 1] - 1 if end % 2 else offsets[end // 2] for end in ends] for ends in from_ends]] if len(held) else None
+    pieces = []
+    for k, (first, last) in enumerate(held):
+        pieces += [tips[k, :1][: int(first)], together[starts[k] : starts[k + 1]], tips[k, 1:][: int(last)]]
+    sizes = np.diff(starts) + held.sum(axis=1)
+    moving = Tubes(np.concatenate(pieces or [together]), np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64), radius, fiber[count:])
+    after = push_apart(moving, Tubes(points, offsets, radii, fiber[:count]), held, params.apart)
+    ours = np.ones(len(after), bool)
+    ours[moving.offsets[:-1][held[:, 0]]] = ours[moving.offsets[1:][held[:, 1]] - 1] = False
+    return after[ours]
 
 
 def _fibers(joins, count):

@@ -272,7 +272,13 @@ def check(strands: Strands, path: Path) -> None:
     _expect(bool(np.all(strands.radius_mm > 0)), path, "radius", "0 or less", "more than 0 mm")
     confidence = strands.confidence
     _expect(bool(np.all((confidence >= 0) & (confidence <= 1))), path, "confidence", "outside its range", "0 to 1")
-    _expect(bool(np.all((strands.kind >= CAPTURED) & (strands.kind <= INFILL))), path, "kind", int(strands.kind.max(initial=0)), "0 (captured) or 1 (infill)")
+    _expect(
+        bool(np.all((strands.kind >= CAPTURED) & (strands.kind <= INFILL))),
+        path,
+        "kind",
+        int(strands.kind.max(initial=0)),
+        "0 (captured) or 1 (infill)",
+    )
 
 
 def _expect(good: bool, path: Path, name: str, found, expected: str) -> None:
