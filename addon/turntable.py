@@ -203,9 +203,7 @@ def _render(strands, view, chosen, frames, wanted: range, resolution, samples, m
     progress(PROGRESS_STAGE, len(wanted) - len(missing), len(wanted))
     if not missing:
         return
-    before = {kind: set(getattr(bpy.data, kind)) for kind in _KINDS}
-    try:
-        scene = bpy.data.scenes.new("Strandscope turntable")
+    with scene_for_now("Strandscope turntable") as scene:
         hair = hair_module.add_hair(strands, "Hair", scene.collection)
         hair.data.materials.append(material.hair_material(melanin))
         rig = rig_scene.build(scene, hair, view, cone_deg=chosen[0].cone_deg)
@@ -215,7 +213,15 @@ def _render(strands, view, chosen, frames, wanted: range, resolution, samples, m
             rig.turn(chosen[i].angle_deg)
             rig.focus(chosen[i].focus_mm)
             scene.cycles.seed = i
-            _render_frame(scene, frames[i], wanted.index(i), len(wanted), progress)
+            render_frame(scene, frames[i], wanted.index(i), len(wanted), progress)
+
+
+@contextmanager
+def scene_for_now(name: str) -> Iterator[bpy.types.Scene]:
+    """A new scene; it and all that is made meanwhile is gone afterwards."""
+    before = {kind: set(getattr(bpy.data, kind)) for kind in _KINDS}
+    try:
+        yield bpy.data.scenes.new(name)
     finally:
         for kind in _KINDS:
             blocks = getattr(bpy.data, kind)
@@ -234,8 +240,8 @@ def _prepare(scene: bpy.types.Scene, resolution: tuple[int, int], samples: int) 
     scene.cycles.samples, scene.cycles.use_adaptive_sampling, scene.cycles.use_denoising = samples, False, True
 
 
-def _render_frame(scene: bpy.types.Scene, out: Path, index: int, count: int, progress: Progress) -> None:
-    """Render one frame to ``out`` (.exr), atomically. A progress callback that raises ends the work after the frame."""
+def render_frame(scene: bpy.types.Scene, out: Path, index: int, count: int, progress: Progress) -> None:
+    """Render one frame to ``out``, atomically. A progress callback that raises ends the work after the frame."""
     stopped: list[BaseException] = []
 
     def watch(text, *_):

@@ -1,5 +1,6 @@
 """How good an infill is, against hair that is known: how much of it there is, where, which way it runs, whether it can be told from hair."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -7,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from .compare import SAMPLE_MM, TRUTH_MM, Truth, _lines, _nearest
 from .errors import StrandscopeError
-from .strands import CAPTURED, INFILL, Strands, fibers
+from .strands import CAPTURED, INFILL, Strands, clip, concatenate, fibers
 
 FOUND_MM = 0.1  # a true fiber this near a captured curve is found there
 HULL_MM = 0.5  # the true hull: what is this near a true fiber
@@ -81,6 +82,14 @@ def fill_summary(report: dict) -> list[tuple[str, str]]:
         ("infill in other hair", f"{report['overlapping_infill']:.4f} of its length; of all length {report['overlapping_all']:.4f}"),
         ("infill told from hair", f"{apart}, {report['pieces']} pieces and {report['hidden_pieces']} hidden ones"),
     ]
+
+
+def parted(hair: Strands, captured: Strands) -> Strands:
+    """True hair in two kinds: CAPTURED, the pieces within FOUND_MM of a captured curve, and INFILL, those that are hidden."""
+    fine = _lines(captured.points_mm, captured.offsets, TRUTH_MM)
+    beyond = _nearest(fine, hair.points_mm)[0] - FOUND_MM
+    found, hidden = clip(hair, -beyond)[0], clip(hair, beyond)[0]
+    return concatenate([replace(found, kind=np.zeros_like(found.kind)), replace(hidden, kind=np.full_like(hidden.kind, INFILL))], hair.provenance)
 
 
 def _crossings(lines, true, inside, height):

@@ -86,9 +86,34 @@ def write_pairs(pairs: list[tuple[np.ndarray, np.ndarray]], captions: list[tuple
         picture.save(part)
 
 
+def write_grid(rows: list[list[np.ndarray]], captions: list[list[str]], out: Path) -> None:
+    """Write rows of pictures, each (H, W, 3) uint8 and all of one size, with their captions below; atomically, with a palette of 256."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    height, width = rows[0][0].shape[:2]
+    across, cell_h = max(len(row) for row in rows), height + CAPTION_PX + GAP_PX
+    pictures = Image.new("RGB", (across * (width + GAP_PX) - GAP_PX, len(rows) * cell_h), PAPER)
+    pen, font = ImageDraw.Draw(pictures), ImageFont.load_default(CAPTION_PX * 5 // 8)
+    for i, (row, texts) in enumerate(zip(rows, captions, strict=True)):
+        for k, (pixels, text) in enumerate(zip(row, texts, strict=True)):
+            x, y = k * (width + GAP_PX), i * cell_h
+            pictures.paste(Image.fromarray(pixels), (x, y))
+            pen.text((x + 5, y + height + 3), text, fill=INK, font=font)
+    with atomic(out) as part:
+        pictures.quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(part, optimize=True)
+
+
 def write_png(pixels: np.ndarray, out: Path) -> None:
     """Write (H, W, 3) uint8 as a picture, atomically."""
     from PIL import Image
 
     with atomic(out) as part:
         Image.fromarray(pixels).save(part)
+
+
+def read_png(path: Path) -> np.ndarray:
+    """A picture as (H, W, 3) uint8."""
+    from PIL import Image
+
+    with Image.open(path) as opened:
+        return np.array(opened.convert("RGB"))

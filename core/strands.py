@@ -81,6 +81,35 @@ def fibers(strands: Strands) -> np.ndarray:
     return np.unique([root(curve) for curve in range(len(strands))], return_inverse=True)[1]
 
 
+def clip(strands: Strands, depth_mm: np.ndarray) -> tuple[Strands, np.ndarray]:
+    """The pieces (m) of curves where depth_mm (N,), linear between points, is above 0, and the number (m,) of the curve that each is of.
+
+    A piece ends where depth_mm is 0. Why curves ended, their errors, evidence and joins are not kept.
+    """
+    depth, last = np.asarray(depth_mm, float), len(strands.points_mm) - 1
+    steps = np.delete(np.arange(last), strands.offsets[1:-1] - 1)  # each from a point to the next of its curve
+    edges = steps[(depth[steps] > 0) != (depth[steps + 1] > 0)]
+    inside = np.flatnonzero(depth > 0)
+    place = np.r_[inside, edges + depth[edges] / (depth[edges] - depth[edges + 1])]  # in points and their fractions
+    enters = np.r_[np.zeros(len(inside), bool), depth[edges] <= 0]
+    order = np.lexsort((enters, place))  # where one piece ends and another begins, it ends first
+    place, enters = place[order], enters[order]
+    curve = np.searchsorted(strands.offsets, place.astype(int), side="right") - 1
+    begins = enters | np.r_[True, np.diff(curve) != 0][: len(place)]
+    sizes = np.bincount(np.cumsum(begins) - 1, minlength=0)
+    long = sizes >= 2
+    keep = np.repeat(long, sizes)
+    low = place[keep].astype(int)
+    share = place[keep] - low
+
+    def between(values):
+        weight = share.reshape(-1, *[1] * (values.ndim - 1))
+        return ((1 - weight) * values[low] + weight * values[np.minimum(low + 1, last)]).astype(np.float32)
+
+    of = curve[begins][long]
+    return Strands(between(strands.points_mm), offsets_of(sizes[long]), between(strands.radius_mm), strands.kind[of], between(strands.confidence)), of
+
+
 def offsets_of(sizes: np.ndarray) -> np.ndarray:
     """Offsets (M + 1,) int64 of curves with sizes (M,) points."""
     return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)

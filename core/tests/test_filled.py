@@ -8,7 +8,7 @@ import pytest
 
 from strandscope.core.compare import Truth
 from strandscope.core.errors import StrandscopeError
-from strandscope.core.filled import HULL_MM, fill_score
+from strandscope.core.filled import FOUND_MM, HULL_MM, fill_score, parted
 from strandscope.core.strands import CAPTURED, INFILL, Strands, offsets_of
 
 RADIUS = 0.03  # mm
@@ -203,3 +203,12 @@ def test_pieces_of_one_fiber_are_not_each_others_neighbours():
     joined = fill_score(replace(strands_of(SHELL, halves), joins=joins), truth_of(LOCK))
     assert joined["pieces"] == 2 * len(CORE)
     assert joined["told_apart"] < 0.75
+
+
+def test_true_hair_is_parted_into_what_was_found_and_what_was_not():
+    found, hidden = np.stack([0 * HEIGHTS, HEIGHTS, 0 * HEIGHTS], axis=1), np.stack([0 * HEIGHTS + 1, HEIGHTS, 0 * HEIGHTS], axis=1)
+    half = parted(strands_of([found, hidden], []), strands_of([found[HEIGHTS < 0] + (0.05, 0, 0)], []))
+    assert half.kind.tolist() == [CAPTURED, INFILL, INFILL]
+    assert abs(half[0][:, 1].max() - half[1][:, 1].min()) < 1e-5
+    assert abs(half[0][:, 1].max()) < 2 * FOUND_MM
+    np.testing.assert_allclose(half[2], hidden, atol=1e-6)

@@ -12,6 +12,7 @@ from strandscope.core.strands import (
     CAPTURED,
     INFILL,
     Strands,
+    clip,
     concatenate,
     describe,
     fibers,
@@ -272,3 +273,29 @@ def test_statistics_of_no_hair_at_all():
     numbers = statistics(make([vertical(0, 0, 1)]).select(np.array([False])))
     assert numbers["curves"] == 0
     assert numbers["mean_curves_crossing_a_horizontal_plane"] == 0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_clipped_curve_is_what_lies_inside_and_ends_at_the_border(seed):
+    rng = np.random.default_rng(seed)
+    strands = make([np.cumsum(rng.normal(0, 0.3, (rng.integers(2, 30), 3)), axis=0) for _ in range(20)])
+    depth = 0.4 - np.abs(strands.points_mm[:, 1].astype(float))
+    pieces, of = clip(strands, depth)
+    beyond, of_beyond = clip(strands, -depth)
+    both = [lengths(part.points_mm, part.offsets) for part in (pieces, beyond)]
+    found = np.bincount(of, both[0], len(strands)) + np.bincount(of_beyond, both[1], len(strands))
+    np.testing.assert_allclose(found, lengths(strands.points_mm, strands.offsets), rtol=1e-5)
+    crossed = np.diff(np.sign(depth)) != 0
+    crossed[strands.offsets[1:-1] - 1] = False
+    tips_inside = np.r_[pieces.offsets[:-1], pieces.offsets[1:] - 1]
+    whole = np.isin(pieces.points_mm[tips_inside], strands.points_mm).all(axis=1)
+    assert np.sum(~whole) == np.sum(crossed)  # each border is where one piece ends
+
+
+def test_clipping_ends_pieces_where_the_depth_is_0_and_tells_their_curves():
+    strands = make([vertical(0, -1, 1), vertical(1, 2, 3), vertical(2, -0.25, 0.25), vertical(3, 0, 2, 3)])
+    pieces, of = clip(strands, 0.6 - np.abs(strands.points_mm[:, 1].astype(float)))
+    assert of.tolist() == [0, 2, 3]
+    for i, (low, high) in enumerate([(-0.6, 0.6), (-0.25, 0.25), (0, 0.6)]):
+        np.testing.assert_allclose(pieces[i][[0, -1], 1], [low, high], atol=1e-6)
+    assert len(clip(strands, np.full(len(strands.points_mm), -1.0))[0]) == 0
