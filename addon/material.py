@@ -1,9 +1,10 @@
-"""Hair as Cycles shades it: the Principled Hair BSDF, coloured by melanin."""
+"""Hair as Cycles shades it: the Principled Hair BSDF, coloured by melanin. And what fills its volume, so that hair is seen within."""
 
 import bpy
 import numpy as np
 
 NAME = "Strandscope Hair"
+VOLUME, SURFACE = "Strandscope Volume", "Strandscope Surface"
 MODELS = ("CHIANG", "HUANG")
 MELANIN = {"black": 0.95, "dark brown": 0.75, "medium brown": 0.6, "light brown": 0.4, "blond": 0.2, "white": 0.03}
 DEFAULT_COLOR = "medium brown"
@@ -38,6 +39,48 @@ def hair_material(melanin: float = MELANIN[DEFAULT_COLOR], redness: float = 0.1,
     material.diffuse_color = (*solid_color(melanin), 1.0)
     material.roughness = 0.6
     return material
+
+
+VOLUME_COLOR, SURFACE_COLOR = (0.9, 0.62, 0.35), (0.25, 0.6, 0.9)
+VOLUME_DENSITY = 300.0  # a metre: light passes 3 mm of what is all hair
+SURFACE_ALPHA = 0.25
+
+
+def volume_material() -> bpy.types.Material:
+    """The material of volumes of hair, made where the file has none: a haze as dense as the grid "density" tells."""
+    if (found := bpy.data.materials.get(VOLUME)) is not None:
+        return found
+    made, haze = _with_one(VOLUME, "VolumePrincipled", "Volume", "Volume")
+    haze.inputs["Color"].default_value = (*VOLUME_COLOR, 1.0)
+    haze.inputs["Density"].default_value = VOLUME_DENSITY
+    haze.inputs["Anisotropy"].default_value = 0.2
+    made.diffuse_color = (*VOLUME_COLOR, 1.0)
+    return made
+
+
+def surface_material() -> bpy.types.Material:
+    """The material of surfaces of hair, made where the file has none: translucent in every mode of the viewport."""
+    if (found := bpy.data.materials.get(SURFACE)) is not None:
+        return found
+    made, glaze = _with_one(SURFACE, "BsdfPrincipled", "BSDF", "Surface")
+    glaze.inputs["Base Color"].default_value = (*SURFACE_COLOR, 1.0)
+    glaze.inputs["Roughness"].default_value = 0.5
+    glaze.inputs["Alpha"].default_value = SURFACE_ALPHA
+    made.surface_render_method = "BLENDED"
+    made.use_transparency_overlap = False  # else the far side and the near one add up, and hide the hair
+    made.diffuse_color = (*SURFACE_COLOR, SURFACE_ALPHA)
+    return made
+
+
+def _with_one(name: str, kind: str, source: str, target: str) -> tuple[bpy.types.Material, bpy.types.Node]:
+    """A new material of one shader node."""
+    made = bpy.data.materials.new(name)
+    nodes = made.node_tree.nodes
+    nodes.clear()
+    shader, output = nodes.new(f"ShaderNode{kind}"), nodes.new("ShaderNodeOutputMaterial")
+    output.location = (320, 0)
+    made.node_tree.links.new(shader.outputs[source], output.inputs[target])
+    return made, shader
 
 
 def solid_color(melanin: float) -> tuple[float, float, float]:

@@ -70,10 +70,11 @@ class STRANDSCOPE_PT_reconstruct(Tab, bpy.types.Panel):
         column.prop(settings, "infill")
         column.prop(settings, "output_path")
         job = context.window_manager.strandscope_job
-        if job.running and job.title == "Reconstruction":
+        if job.running and job.title in ("Reconstruction", "Volume"):
             _job(layout, context)
         else:
             layout.operator("strandscope.reconstruct", icon="STRANDS")
+            layout.operator("strandscope.show_volume", icon="VOLUME_DATA")
 
 
 class STRANDSCOPE_PT_hair(Tab, bpy.types.Panel):

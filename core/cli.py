@@ -741,6 +741,36 @@ def figures(session, capture, out, strands, height, at, fiber, sweep, only, zoom
     session.report.done(page)
 
 
+@main_group.command(short_help="Tell where the hair is, as a volume or as a mesh.")
+@click.argument("capture", type=PATH)
+@click.argument("strands", type=PATH)
+@click.option("-o", "--output", type=PATH, help="The file to write: a volume (.vdb), a mesh (.ply), or all numbers (.npz).  [default: what is kept]")
+@click.option("--calibration", type=PATH, help="What is wrong with the rig, if the curves were made with it.")
+@click.option("--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processor cores to use; all of them if not given.")
+@common
+@click.pass_obj
+def volume(session, capture, strands, output, calibration, workers):
+    """Tell where the hair of a strands file is, inside and between its curves: what the infill grows in.
+
+    A voxel near a captured curve is hair, and so is the core of the volume that few cameras see into. A .vdb holds how much of
+    each voxel is hair, 0 to 1, in the grid "density"; a .ply is the surface. Lengths are mm, y is up. It is kept in the folder
+    beside STRANDS, where a reconstruction with infill leaves it too: to write it again takes a moment.
+
+    \b
+    Example:
+      strandscope volume lock out/strands.npz -o out/hair.vdb
+    """
+    from . import pipeline
+    from .volume import SUFFIXES, write_volume
+
+    if output is not None and output.suffix.lower() not in SUFFIXES:
+        raise click.UsageError(f"{output}: expected a name that ends in {', '.join(SUFFIXES)}")
+    found = pipeline.find_volume(capture, strands, calibration=calibration, workers=workers, progress=session.report)
+    if output is not None:
+        write_volume(output, found)
+    session.report.done(output or pipeline.volume_path(strands))
+
+
 @main_group.command(short_help="Count and measure the hairs of a strands file.")
 @click.argument("strands", type=PATH)
 @click.option("--json", "json_file", type=PATH, help="Write the numbers to this file too.")

@@ -28,12 +28,13 @@ from .features import SweepFeatures, unpack
 from .files import atomic
 from .geometry import camera_points, object_points, to_image, to_pixel
 from .groom import Groom
-from .hull import Grid, HullParams, carved_inside, grid_of, hull_inside, occupancy
-from .pipeline import Parameters, find_features, has_work_folder, preset, reconstruct, resolve, volumes, work_folder
+from .hull import Grid, carved_inside, grid_of, hull_inside, occupancy
+from .pipeline import Parameters, find_features, has_work_folder, kept_volume, made_with, make_volume, preset, reconstruct, resolve, work_folder
 from .progress import Progress, silent
 from .ridges import BINS, RidgeParams, detect, gabor_bank, line_banks, response
 from .simulate import LOOKS, density, drawing, lens, photograph, prepare, shade
 from .strands import INFILL, Strands, lengths, load_strands, offsets_of
+from .volume import Volume
 
 NAMES = {  # number in the paper -> file
     "2b": "figure_2b_row", "2c": "figure_2c_star", "3": "figure_3_ribbons", "5": "figure_5_filters", "6": "figure_6_fiber",
@@ -186,19 +187,24 @@ def figures(
     strands = load_strands(strands_path)
     if len(strands.captured) == 0:
         raise StrandscopeError(f"{strands_path}: holds no captured curve; expected one at least, to look at")
-    parameters = resolve(capture, _made_with(strands))
+    parameters = resolve(capture, made_with(strands))
     capture = capture.reduced(parameters.ridges.reduce)
     beside = Path(strands_path) if has_work_folder(capture, Path(strands_path), parameters) else out / "strands.npz"
     work = work_folder(capture, beside, parameters)
     sweeps = find_features(capture, work, parameters, workers, progress)
     scene = look_at(capture, strands, truth, parameters, sweeps, params)
+
+    def volume() -> Volume:
+        kept = kept_volume(strands_path, strands, parameters)
+        return kept or make_volume(capture, work, sweeps, strands.captured, parameters, workers, progress)
+
     draw: dict[str, Callable[[Path], str]] = {
         "2b": lambda path: row_figure(scene, path),
         "2c": lambda path: star_figure(scene, path),
         "3": lambda path: ribbons_figure(scene, path),
         "5": lambda path: filters_figure(scene, path),
         "6": lambda path: fiber_figure(scene, path),
-        "9": lambda path: hull_figure(scene, *volumes(capture, work, sweeps, parameters.hull, workers, progress)[1:], path),
+        "9": lambda path: hull_figure(scene, volume(), path),
         "10": lambda path: hair_figure(scene, path),
         "14": lambda path: overlay_figure(scene, path),
         "recall": lambda path: recall_figure(scene, path),
@@ -216,15 +222,6 @@ def _changed(capture: Capture, path: Path) -> float:
     """When a capture, read from ``path``, was changed last, in seconds."""
     files = [capture.folder / file for sweep in capture.sweeps for file in sweep.files]
     return max(os.stat(file).st_mtime for file in [path / FILE_NAME if path.is_dir() else path, *files])
-
-
-def _made_with(strands: Strands) -> Parameters:
-    """The parameters of the filter and the hull that strands were made with, as far as their provenance tells, else the usual."""
-    told = strands.provenance.get("parameters", {})
-    try:
-        return replace(preset(), ridges=RidgeParams(**told["ridges"]), hull=HullParams(**told["hull"]))
-    except (KeyError, TypeError):
-        return preset()
 
 
 # ---- the place -------------------------------------------------------------------------------------------------------
@@ -824,20 +821,18 @@ def _wheel(axes) -> None:
 # ---- 9: hull, carving, both ------------------------------------------------------------------------------------------
 
 
-def hull_figure(scene: Scene, blueness: np.ndarray, rays: np.ndarray, path: Path) -> str:
-    """The visual hull, the carved volume and their combination, from outside and cut (Fig. 9); returns a caption.
-
-    blueness, rays: (nx, ny, nz) of ``visual_hull`` and ``carve``.
-    """
-    grid, params = scene.grid, scene.parameters.hull
+def hull_figure(scene: Scene, volume: Volume, path: Path) -> str:
+    """The visual hull, the carved volume, their combination and the occupancy, from outside and cut (Fig. 9); returns a caption."""
+    grid, params, blueness, rays = volume.grid, scene.parameters.hull, volume.blueness, volume.rays
     hull = hull_inside(blueness, grid, params)
     soft = [ndimage.gaussian_filter(v.astype(np.float32), 0.8) for v in (hull, carved_inside(rays, hull, grid, params))]
-    solids = [("visual hull", soft[0]), ("space carving", soft[1]), ("both", occupancy(blueness, rays, grid, params))]
+    both = occupancy(blueness, rays, grid, params)
+    solids = [("visual hull", soft[0]), ("space carving", soft[1]), ("both", both), ("with the curves", volume.density)]
     level = int(np.clip(grid.to_cells(scene.at_mm)[1], 0, grid.shape[1] - 1))
     places = slice_at(scene, scene.at_mm[1]).curves
     low, high = np.asarray(grid.origin_mm), grid.high_mm
-    with _page(path, 11.4, 8.3) as figure:
-        panels = figure.subplots(2, 3)
+    with _page(path, 14.6, 8.1) as figure:
+        panels = figure.subplots(2, 4)
         for (name, solid), outside, cut in zip(solids, *panels, strict=True):
             outside.imshow(lit(solid, grid), cmap="bone", vmin=0, vmax=1.05)
             _bare(outside)
@@ -848,7 +843,8 @@ def hull_figure(scene: Scene, blueness: np.ndarray, rays: np.ndarray, path: Path
         _key(figure, [cut])
     return (
         "What is left where the blue board was never seen in focus (visual hull), where few rays of sight from features to their camera pass (space "
-        "carving), and of both, in which the infill grows: the hull closes over hollows, the carving keeps what no ray crossed beside the hair."
+        "carving), and of both: the hull closes over hollows, the carving keeps what no ray crossed beside the hair. The last is where the infill "
+        "grows: close about the curves, and of the volume before it only the core that few cameras see into."
     )
 
 

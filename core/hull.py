@@ -19,6 +19,7 @@ from scipy.ndimage import gaussian_filter
 from .capture import Sweep
 from .errors import StrandscopeError
 from .geometry import Optics, project, to_image, to_pixel, turn, turn_back
+from .grid import Grid
 
 _turn, _turn_back, _project, _to_pixel = njit(turn), njit(turn_back), njit(project), njit(to_pixel)
 _BLUENESS_STEPS = 255.0  # a relative blueness of 0…1 as uint8
@@ -41,50 +42,6 @@ class HullParams:
     clearance_mm: float = 1.2  # a ray says nothing this near its feature, the paper's depth of field (the paper: 0)
     min_views: float = 0.5  # share of the sweeps that must have a voxel in focus, else nothing is said and it is empty
     blur_mm: float = 0.4  # standard deviation of the blur that makes fractional densities
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Cubes of the object frame; cell (i, j, k) spans origin + (i…i+1, j…j+1, k…k+1) voxel edges along x, y, z."""
-
-    origin_mm: tuple[float, float, float]
-    voxel_mm: float
-    shape: tuple[int, int, int]
-
-    @classmethod
-    def around(cls, low_mm, high_mm, voxel_mm: float) -> "Grid":
-        """The grid of whole voxels about the middle of a box that covers it. Raises StrandscopeError for an empty box."""
-        low, high = np.asarray(low_mm, float), np.asarray(high_mm, float)
-        if not voxel_mm > 0:
-            raise StrandscopeError(f"voxel_mm is {voxel_mm}; expected more than 0")
-        if not (np.all(np.isfinite(high - low)) and np.all(high > low)):
-            raise StrandscopeError(f"the volume spans {low.tolist()} to {high.tolist()} mm; expected more than nothing along x, y and z")
-        shape = np.maximum(np.ceil((high - low) / voxel_mm - 1e-6), 1).astype(int)
-        origin = (low + high - shape * voxel_mm) / 2
-        return cls(tuple(origin.tolist()), float(voxel_mm), tuple(shape.tolist()))
-
-    @property
-    def high_mm(self) -> np.ndarray:
-        """The far corner (3,)."""
-        return np.asarray(self.origin_mm) + np.asarray(self.shape) * self.voxel_mm
-
-    def to_cells(self, points_mm) -> np.ndarray:
-        """Points (..., 3) mm -> in voxel edges from the corner (..., 3): the floor is the index, centres lie at .5."""
-        return (np.asarray(points_mm, float) - self.origin_mm) / self.voxel_mm
-
-    def to_mm(self, cells) -> np.ndarray:
-        """The inverse of ``to_cells``."""
-        return np.asarray(cells, float) * self.voxel_mm + self.origin_mm
-
-    def centres(self, axis: int) -> np.ndarray:
-        """Coordinates (n,) mm of the voxels' centres along one axis."""
-        return self.origin_mm[axis] + (np.arange(self.shape[axis]) + 0.5) * self.voxel_mm
-
-    def check(self, volume: np.ndarray, name: str) -> np.ndarray:
-        """The volume, or StrandscopeError where its shape is not the grid's."""
-        if np.shape(volume)[:3] != self.shape:
-            raise StrandscopeError(f"{name} has shape {np.shape(volume)}; expected the grid's {self.shape}")
-        return volume
 
 
 def grid_of(optics: Optics, image_shape: tuple[int, int], sweeps: Iterable[Sweep], voxel_mm: float) -> Grid:

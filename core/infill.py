@@ -21,9 +21,8 @@ from .advection import AdvectionParams, captured_density, direction_field, unifo
 from .apart import ApartParams, Tubes, push_apart
 from .errors import StrandscopeError
 from .flow import Flow, across, departures, flow, way_at
+from .grid import Grid, occupied
 from .hidden import hidden
-from .hull import Grid
-from .inside import occupied
 from .links import LinkParams, bridge, find_links, ways_on
 from .progress import Progress, silent
 

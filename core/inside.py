@@ -11,8 +11,8 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import cKDTree
 
+from .grid import EDGE_MM, Grid
 from .hidden import seen_from
-from .hull import Grid
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class InsideParams:
     about_mm: float = 0.5  # hair is taken to fill what is this near to a fiber
     air_mm: float = 0.8  # depth in the bounding volume up to which it may be air
     core_seen_by: float = 6.0  # angles, from which on the curves tell all there is
-    edge_mm: float = 0.4  # over which the occupancy falls from 1 to 0
+    edge_mm: float = EDGE_MM  # over which the occupancy falls from 1 to 0
     view_blur_mm: float = 0.15  # of the density that hides
 
 
@@ -45,9 +45,3 @@ def surface_distance(
     core = (deep > params.air_mm) & (seen < params.core_seen_by)
     into = distance_transform_edt(core) - distance_transform_edt(~core) if core.any() else np.full(grid.shape, -np.inf)
     return np.maximum(about, np.clip((into + np.where(core, -0.5, 0.5)) * grid.voxel_mm, -far, None)).astype(np.float32)
-
-
-def occupied(distance_mm: np.ndarray, edge_mm: float = InsideParams.edge_mm) -> np.ndarray:
-    """Occupancy (nx, ny, nz) float32 of 0…1 for a ``surface_distance``: 0.5 at the surface, a smooth step over edge_mm."""
-    share = np.clip(0.5 + np.asarray(distance_mm) / edge_mm, 0.0, 1.0)
-    return (share * share * (3.0 - 2.0 * share)).astype(np.float32)

@@ -54,13 +54,14 @@ from .rig.calibrate import (
     solve,
     turns,
 )
-from .strands import CAPTURED, INFILL, Strands, concatenate, save_strands
+from .strands import CAPTURED, INFILL, Strands, concatenate, load_strands, save_strands
+from .volume import Volume, load_volume, save_volume, surface
 
 VERSION = "0.1.0"
 WORKING_ROOM = 600_000_000  # bytes: the program itself, seed cells, a batch of curves
 UNKNOWN_ERROR_MM = 0.02
 SAMPLED_PHOTOGRAPHS = 24  # that ``estimate`` looks at
-STAMP, JOURNAL, USED_UP = "made-from.txt", "growing.journal", "growing.used"  # in the work folder
+STAMP, JOURNAL, USED_UP, VOLUME = "made-from.txt", "growing.journal", "growing.used", "volume.npz"  # in the folder beside the output
 # Table 1: c in 12-bit numbers with the black level (128) in it, omega in degrees, gamma in px, boxes in px
 _TABLE_1 = {"straight": (-140, 1.5, 0.5, (40.0, 30.0, 8.0)), "wavy": (-90, 1.5, 0.5, (60.0, 30.0, 8.0)), "curls": (-70, 1.5, 0.5, (60.0, 30.0, 8.0))}
 
@@ -140,7 +141,7 @@ def reconstruct(
         provenance = {"capture": capture.name, "version": VERSION, "parameters": asdict(parameters)}
         strands = captured_strands(grown, error, radius, provenance)
         if parameters.infill is not None:
-            strands = infill_strands(capture, work, sweeps, strands, parameters, workers, progress)
+            strands = infill_strands(capture, work, sweeps, strands, parameters, workers, progress, volume_path(out))
         save_strands(out, strands)
         journal.delete()
     return strands
@@ -511,22 +512,34 @@ def captured_strands(grown: Grown, error_mm: np.ndarray | None, radius_mm: np.nd
 
 
 def infill_strands(
-    capture: Capture, work: Path, sweeps: list[SweepFeatures], strands: Strands, parameters: Parameters, workers: int, progress: Progress
+    capture: Capture,
+    work: Path,
+    sweeps: list[SweepFeatures],
+    strands: Strands,
+    parameters: Parameters,
+    workers: int,
+    progress: Progress,
+    kept: Path | None = None,
 ) -> Strands:
-    """The captured ``strands`` and hair for the inside that no camera sees (sec. 4.3)."""
-    grid, hull, rays = volumes(capture, work, sweeps, parameters.hull, workers, progress)
-    bounds, params = occupancy(hull, rays, grid, parameters.hull), parameters.infill
-    with _threads(workers):
-        if params.method == "paper":
-            advection = replace(params.advection, count=params.count, seed=params.seed)
+    """The captured ``strands`` and hair for the inside that no camera sees (sec. 4.3). Where that is, is written to the file ``kept``, if one
+    is given, except for the paper's method."""
+    params = parameters.infill
+    if params.method == "paper":
+        grid, hull, rays = volumes(capture, work, sweeps, parameters.hull, workers, progress)
+        advection = replace(params.advection, count=params.count, seed=params.seed)
+        bounds = occupancy(hull, rays, grid, parameters.hull)
+        with _threads(workers):
             filled = advect(strands.points_mm, strands.offsets, strands.radius_mm, bounds, grid, advection, progress)
-            joins = None
-        else:
-            angles = np.array([sweep.angle_deg for sweep in capture.sweeps])
-            distance = inside(strands, bounds, grid, angles, parameters.inside)
-            through = free_share(rays, distance < -parameters.inside.about_mm / 2)
-            filled = infill(_told(strands), distance, through, grid, angles, params, progress)
-            joins = filled.joins
+        joins = None
+    else:
+        volume = make_volume(capture, work, sweeps, strands, parameters, workers, progress)
+        if kept is not None:
+            save_volume(kept, volume)
+        angles = np.array([sweep.angle_deg for sweep in capture.sweeps])
+        through = free_share(volume.rays, volume.distance_mm < -parameters.inside.about_mm / 2)
+        with _threads(workers):
+            filled = infill(_told(strands), volume.distance_mm, through, volume.grid, angles, params, progress)
+        joins = filled.joins
     count = len(filled.offsets) - 1
     added = Strands(
         points_mm=filled.points_mm,
@@ -553,6 +566,79 @@ def _told(strands: Strands) -> Captured:
     evidence = np.zeros(count) if strands.evidence is None else strands.evidence
     stops = np.zeros((len(strands), 2), np.uint8) if strands.stops is None else strands.stops
     return Captured(strands.points_mm, strands.offsets, strands.radius_mm, error, evidence, stops)
+
+
+def make_volume(
+    capture: Capture, work: Path, sweeps: list[SweepFeatures], strands: Strands, parameters: Parameters, workers: int, progress: Progress
+) -> Volume:
+    """Where the hair is, by the cameras and the captured ``strands`` together."""
+    grid, hull, rays = volumes(capture, work, sweeps, parameters.hull, workers, progress)
+    angles = np.array([sweep.angle_deg for sweep in capture.sweeps])
+    with _threads(workers):
+        distance = inside(strands, occupancy(hull, rays, grid, parameters.hull), grid, angles, parameters.inside)
+    return Volume(grid, hull, rays, distance, parameters.inside.edge_mm, *surface(distance, grid), _volume_from(strands, parameters))
+
+
+def find_volume(capture_path: Path, strands_path: Path, *, calibration: Path | None = None, workers: int = 1, progress: Progress = silent) -> Volume:
+    """Where the hair is that a capture and the ``strands_path`` made of it tell: as the reconstruction kept it beside the strands, or found
+    now, and kept there (``volume_path``).
+
+    calibration: the file that the strands were made with. Raises CaptureError and StrandscopeError for what cannot be read or written, and
+    for strands without a captured curve.
+    """
+    strands = load_strands(strands_path).captured
+    if len(strands) == 0:
+        raise StrandscopeError(f"{strands_path}: holds no captured curve; expected one at least, to tell where hair is")
+    parameters = made_with(strands)
+    if (volume := kept_volume(strands_path, strands, parameters)) is not None:
+        return volume
+    capture = load_capture(capture_path)
+    if calibration is not None:
+        capture = calibrated(calibration, capture)
+    parameters = resolve(capture, parameters)
+    capture = capture.reduced(parameters.ridges.reduce)
+    own = Path(strands_path)
+    if not has_work_folder(capture, own, parameters):  # what another capture, or another calibration, left there is not touched
+        own = own.with_name(own.stem + "_volume.npz")
+    work = work_folder(capture, own, parameters)
+    sweeps = find_features(capture, work, parameters, workers, progress)
+    volume = make_volume(capture, work, sweeps, strands, parameters, workers, progress)
+    save_volume(volume_path(strands_path), volume)
+    return volume
+
+
+def kept_volume(strands_path: Path, strands: Strands, parameters: Parameters) -> Volume | None:
+    """The volume that was kept beside strands, if it is there, whole, and was made from their captured curves with these parameters."""
+    path = volume_path(strands_path)
+    try:
+        volume = load_volume(path) if path.is_file() else None
+    except StrandscopeError:  # it is made anew
+        return None
+    return volume if volume is not None and volume.made_from == _volume_from(strands.captured, parameters) else None
+
+
+def volume_path(strands_path: Path) -> Path:
+    """Where the volume of strands is kept: never in the capture."""
+    return _work_path(Path(strands_path)) / VOLUME
+
+
+def _volume_from(strands: Strands, parameters: Parameters) -> str:
+    """A digest of the captured strands and of the parameters that a volume is made with."""
+    told = json.dumps([VERSION, asdict(parameters.hull), asdict(parameters.inside)], sort_keys=True)
+    digest = hashlib.sha256(told.encode())
+    for values, dtype in ((strands.points_mm, np.float32), (strands.offsets, np.int64), (strands.radius_mm, np.float32)):
+        digest.update(np.ascontiguousarray(values, dtype).tobytes())
+    return digest.hexdigest()
+
+
+def made_with(strands: Strands) -> Parameters:
+    """The parameters of the filter, the hull and the occupancy that strands were made with, as far as their provenance tells, else the usual."""
+    told = strands.provenance.get("parameters", {})
+    try:
+        parameters = replace(preset(), ridges=RidgeParams(**told["ridges"]), hull=HullParams(**told["hull"]))
+        return replace(parameters, inside=InsideParams(**told.get("inside", {})))
+    except (KeyError, TypeError):
+        return preset()
 
 
 def volumes(

@@ -18,14 +18,20 @@ def show_strands(context, strands: Strands, name: str) -> bpy.types.Object:
     if len(bpy.data.hair_curves) == 1:  # the first hair of a file is shown as thick as it is, not as lines
         context.scene.render.hair_type = "STRIP"
     new.data.materials.append(bpy.data.materials.get(material.NAME) or material.hair_material())
+    look_at(context, [new])
+    return new
+
+
+def look_at(context, objects: list[bpy.types.Object]) -> None:
+    """Select these objects only, the first active, and bring them into view."""
     if context.object and context.object.mode != "OBJECT":
         bpy.ops.object.mode_set(mode="OBJECT")
     for other in context.selected_objects:
         other.select_set(False)
-    new.select_set(True)
-    context.view_layer.objects.active = new
+    for each in objects:
+        each.select_set(True)
+    context.view_layer.objects.active = objects[0]
     _frame_selected(context)
-    return new
 
 
 def _frame_selected(context) -> None:

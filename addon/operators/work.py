@@ -1,4 +1,4 @@
-"""Long work: reconstruction and comparison, each a job in a child process."""
+"""Long work: reconstruction, the volume and the comparison, each a job in a child process."""
 
 from pathlib import Path
 
@@ -6,10 +6,11 @@ import bpy
 
 from ...core.errors import StrandscopeError
 from ...core.strands import load_strands, save_strands
-from .. import hair, pictures
+from ...core.volume import load_volume
+from .. import hair, pictures, volume
 from ..jobs import Command, JobOperator
 from ..props import preferences
-from .bring_in import show_strands
+from .bring_in import look_at, show_strands
 
 
 def _idle(cls, context) -> bool:
@@ -53,6 +54,36 @@ class STRANDSCOPE_OT_reconstruct(JobOperator, bpy.types.Operator):
         strands = load_strands(output)
         show_strands(context, strands, str(strands.provenance.get("capture") or context.scene.strandscope.capture_name)[:60])
         self.report({"INFO"}, f"{len(strands)} strands, also in {output}")
+
+
+class STRANDSCOPE_OT_show_volume(JobOperator, bpy.types.Operator):
+    """Show where hair is, inside and between the curves of the output file, as a volume and as a surface. Esc stops"""
+
+    bl_idname = "strandscope.show_volume"
+    bl_label = "Show the Volume"
+    bl_options = {"UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        if not _idle(cls, context) or not _captured(cls, context):
+            return False
+        if not context.scene.strandscope.output_file.is_file():
+            cls.poll_message_set("Reconstruct first: there is no output file yet")
+            return False
+        return True
+
+    def command(self, context) -> Command:
+        settings, user, out = context.scene.strandscope, preferences(context), context.scene.strandscope.output_file
+        arguments = ["volume", settings.capture_folder, out]
+        if user.workers:
+            arguments += ["--workers", user.workers]
+        return Command("Volume", tuple(map(str, arguments)), out.with_name(f"{out.stem}_volume.log"))
+
+    def finish(self, context, output: Path) -> None:
+        path = output.parent.with_suffix(".vdb")  # beside the strands, as is the folder that it was kept in
+        made = volume.add_volume(load_volume(output), path, context.scene.strandscope.capture_name[:50], context.collection)
+        look_at(context, made)
+        self.report({"INFO"}, f"The volume is in {made[0].data.filepath}")
 
 
 class STRANDSCOPE_OT_compare(JobOperator, bpy.types.Operator):
@@ -115,4 +146,4 @@ class STRANDSCOPE_OT_cancel(bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (STRANDSCOPE_OT_reconstruct, STRANDSCOPE_OT_compare, STRANDSCOPE_OT_open_comparison, STRANDSCOPE_OT_cancel)
+CLASSES = (STRANDSCOPE_OT_reconstruct, STRANDSCOPE_OT_show_volume, STRANDSCOPE_OT_compare, STRANDSCOPE_OT_open_comparison, STRANDSCOPE_OT_cancel)

@@ -6,8 +6,8 @@ import pytest
 
 from strandscope.core.advection import captured_density
 from strandscope.core.errors import StrandscopeError
-from strandscope.core.hull import Grid
-from strandscope.core.inside import InsideParams, occupied, surface_distance
+from strandscope.core.grid import Grid, occupied
+from strandscope.core.inside import InsideParams, surface_distance
 
 GRID = Grid.around((-5.0, -1.5, -5.0), (5.0, 1.5, 5.0), 0.25)
 ANGLES = np.arange(24) * 15.0
