@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from strandscope.core.advection import AdvectionParams
 from strandscope.core.compare import load_truth, score
 from strandscope.core.errors import StrandscopeError
 from strandscope.core.infill import InfillParams
@@ -51,7 +52,8 @@ def test_hair_ends_up_where_it_is(capture, tmp_path):
     """A sign that is wrong anywhere between the lens and the file puts the curves beside the fibers."""
     out = tmp_path / "out" / "strands.npz"
     # hair this thin has no inside to be filled: the infill is asked for a number of strands and is content with little density
-    strands = reconstruct(capture, out, replace(preset("straight"), infill=InfillParams(count=5, min_mean_density=0.3)))
+    content = InfillParams(method="paper", count=5, advection=AdvectionParams(min_mean_density=0.3))
+    strands = reconstruct(capture, out, replace(preset("straight"), infill=content))
     truth = load_truth(capture / "truth.npz")
     report = score(strands, truth)
     # four fibers that hardly hide one another: 1.0 and 1.0 and 5.5 um were measured; a ghost would cost 0.2, half a pixel is 14 um
