@@ -42,7 +42,7 @@ def hair_material(melanin: float = MELANIN[DEFAULT_COLOR], redness: float = 0.1,
 
 
 VOLUME_COLOR, SURFACE_COLOR = (0.9, 0.62, 0.35), (0.25, 0.6, 0.9)
-VOLUME_DENSITY = 300.0  # a metre: light passes 3 mm of what is all hair
+VOLUME_DENSITY = 0.3  # a mm, in which the volume's data are: light passes 3 mm of what is all hair
 SURFACE_ALPHA = 0.25
 
 

@@ -8,12 +8,12 @@ import pytest
 from mathutils import Vector
 
 from strandscope.addon import hair, material
-from strandscope.addon.volume import add_volume, to_world
+from strandscope.addon.volume import add_volume
 from strandscope.core.errors import StrandscopeError
 from strandscope.core.grid import Grid
 from strandscope.core.pipeline import preset, reconstruct
 from strandscope.core.simulate import SimulateParams, simulate
-from strandscope.core.volume import Volume, surface
+from strandscope.core.volume import Volume, centres, surface
 
 GRID = Grid.around((-2.0, -1.0, -3.0), (3.0, 5.0, 3.0), 0.1)
 MIDDLE, RADIUS, EDGE = np.array([0.7, 2.5, -0.6]), 1.4, 0.4  # mm; on no axis, so that a wrong sign shows
@@ -56,15 +56,42 @@ def test_blender_sees_the_ball_where_the_hair_is(tmp_path):
     volume, mesh = add_volume(ball(), tmp_path / "ball.vdb")
     assert volume.data.grids.load()
     assert [(grid.name, grid.data_type) for grid in volume.data.grids] == [("density", "FLOAT")]
-    np.testing.assert_allclose(np.array(volume.data.grids[0].matrix_object), to_world(ball()), atol=1e-9)
-    assert np.array(volume.matrix_world) == pytest.approx(np.eye(4))
+    np.testing.assert_allclose(np.array(volume.data.grids[0].matrix_object), centres(GRID), atol=1e-6)
+    points = np.random.default_rng(0).uniform(-5, 5, (9, 3))
+    np.testing.assert_allclose([volume.matrix_world @ Vector(point) for point in points], hair.to_blender(points), atol=1e-9)
     for threshold, depth in ((0.5, 0.0), (0.104, -0.12), (0.896, 0.12)):  # of the smooth step over EDGE: 0.2 and 0.8 of it
         off = away(meshed(volume, threshold)) - (RADIUS - depth)
         assert len(off) > 500
         assert np.abs(off).max() < 0.02  # mm, a fifth of a voxel
     assert np.abs(away(vertices(mesh)) - RADIUS).max() < 0.5 * GRID.voxel_mm / 10
-    low, high = (np.array(volume.bound_box)[[0, 6]]).astype(float)
-    assert np.all(np.abs(0.5 * (low + high) - hair.to_blender(MIDDLE)) < 8e-4 * GRID.voxel_mm * 10)
+
+
+@pytest.mark.parametrize("scale", [1, 10])
+def test_cycles_shows_it_there(tmp_path, scale):
+    """In metres Cycles would show voxels this small elsewhere, though Volume to Mesh finds them in place."""
+    volume, mesh = add_volume(ball(), tmp_path / "ball.vdb")
+    volume.scale, mesh.hide_render = [scale * factor for factor in volume.scale], True
+    haze = volume.data.materials[0].node_tree.nodes["Principled Volume"]
+    haze.inputs["Density"].default_value, haze.inputs["Color"].default_value = 6.0, (0, 0, 0, 1)  # smoke in front of a white sky
+    scene = bpy.context.scene
+    scene.world = bpy.data.worlds.new("sky")
+    scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (1, 1, 1, 1)
+    scene.render.engine, scene.cycles.samples, scene.view_settings.view_transform = "CYCLES", 8, "Raw"
+    scene.render.resolution_x = scene.render.resolution_y = 100
+    scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.camera.data.type, scene.camera.data.ortho_scale, scene.camera.data.clip_start = "ORTHO", 0.01 * scale, 1e-4
+    scene.collection.objects.link(scene.camera)
+    for place, turn, right, up in (((0, -0.03, 0), (np.pi / 2, 0, 0), 0, 2), ((0, 0, 0.03), (0, 0, 0), 0, 1)):
+        scene.camera.location, scene.camera.rotation_euler = [scale * x for x in place], turn
+        scene.render.filepath = str(tmp_path / "seen.png")
+        bpy.ops.render.render(write_still=True)
+        picture = bpy.data.images.load(scene.render.filepath)
+        dark = np.array(picture.pixels).reshape(100, 100, 4)[..., 0] < 0.5  # from the lowest row up
+        bpy.data.images.remove(picture)
+        rows, columns = np.nonzero(dark)
+        seen = 0.1 * (np.array([columns.mean(), rows.mean()]) - 49.5)  # mm
+        assert seen == pytest.approx(hair.to_blender(MIDDLE)[[right, up]] * 1000, abs=0.05)
+        assert np.sqrt(dark.sum() * 0.01 / np.pi) == pytest.approx(RADIUS + EDGE / 4, abs=EDGE / 4 + 0.05)
 
 
 def test_the_mesh_faces_outwards_and_hair_is_seen_through_both(tmp_path):
