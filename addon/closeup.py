@@ -37,8 +37,8 @@ class CloseupParams:
 
     width_mm: float = 6.0
     height_mm: float = 4.6
-    width_px: int = 470
-    samples: int = 128
+    width_px: int = 410
+    samples: int = 36
     melanin: float = material.MELANIN["medium brown"]
     tilt_deg: float = 0.0  # of what is above towards the camera: 0 from the front, 90 from above
     slab_mm: float | None = None  # thickness of a cross-section, in flat colours; None: all of the hair

@@ -12,11 +12,12 @@ parser = argparse.ArgumentParser(description="Renders captured curves, the paper
 parser.add_argument("out", type=Path)
 parser.add_argument("--row", nargs=4, action="append", required=True, metavar=("TITLE", "TRUTH", "PAPER", "OURS"))
 parser.add_argument("--section", type=float, metavar="MM", help="a slab of this thickness, from above")
-parser.add_argument("--tilt", type=float, default=0.0, metavar="DEG", help="0 from the front, 90 from above")
+parser.add_argument("--tilt", type=float, metavar="DEG", help="0 from the front, 90 from above; a section is seen from above")
 parser.add_argument("--field", type=float, nargs=2, default=(6.0, 4.6), metavar=("MM", "MM"), help="width and height of what is seen")
-parser.add_argument("--width", type=int, default=470, metavar="PX")
-parser.add_argument("--samples", type=int, default=128)
+parser.add_argument("--width", type=int, default=410, metavar="PX")
+parser.add_argument("--samples", type=int, default=36)
 given = parser.parse_args()
 rows = [Row(title, Path(truth), Path(paper), Path(ours)) for title, truth, paper, ours in given.row]
-params = CloseupParams(*given.field, given.width, given.samples, tilt_deg=given.tilt, slab_mm=given.section)
+tilt = given.tilt if given.tilt is not None else 90.0 if given.section else 0.0
+params = CloseupParams(*given.field, given.width, given.samples, tilt_deg=tilt, slab_mm=given.section)
 print(render_closeups(rows, given.out, params, lambda stage, done, total: print(f"{stage} {done}/{total}", flush=True)))
