@@ -16,7 +16,7 @@ from scipy.sparse import csr_array, diags_array, eye_array, kron
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from .errors import StrandscopeError
-from .hull import Grid
+from .grid import Grid
 from .laplace import KNOWN, OUTSIDE, UNKNOWN, laplace_fill
 from .progress import Progress, silent
 

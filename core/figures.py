@@ -27,8 +27,9 @@ from .errors import StrandscopeError
 from .features import SweepFeatures, unpack
 from .files import atomic
 from .geometry import camera_points, object_points, to_image, to_pixel
+from .grid import Grid
 from .groom import Groom
-from .hull import Grid, carved_inside, grid_of, hull_inside, occupancy
+from .hull import carved_inside, grid_of, hull_inside, occupancy
 from .pipeline import Parameters, find_features, has_work_folder, kept_volume, made_with, make_volume, preset, reconstruct, resolve, work_folder
 from .progress import Progress, silent
 from .ridges import BINS, RidgeParams, detect, gabor_bank, line_banks, response

@@ -1,8 +1,10 @@
-"""Writing files so that a reader sees the whole of one or nothing of it."""
+"""Files: written so that a reader sees the whole of one or nothing of it, and TOML read with errors in words."""
 
 import errno
+import hashlib
 import os
 import time
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -28,6 +30,22 @@ def atomic(path: Path) -> Iterator[Path]:
         raise explain(error, path) from error
     finally:
         part.unlink(missing_ok=True)
+
+
+def toml_tables(path: Path, holding: str) -> dict:
+    """What a TOML file holds. Raises StrandscopeError for one that is not there, told what was expected in it, or that is not TOML."""
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise StrandscopeError(f"{path}: not found; expected a TOML file with {holding}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise StrandscopeError(f"{path}: not valid TOML: {error}") from error
+
+
+def sha256(path: Path) -> str:
+    """The SHA-256 of a file's bytes, as 64 hexadecimal digits."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def sync_folder(folder: Path) -> None:

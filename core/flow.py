@@ -1,7 +1,7 @@
 """Which way hair runs at a place, told by the curves around it, and how a single hair departs from that.
 
 Neighbours count by their distance, and only those that run roughly the same way, so that wisps that cross are kept apart.
-Where a place has no curves near it, a field carried in from outside (``infill.direction_field``) says the way.
+Where a place has no curves near it, a field carried in from outside (``advection.direction_field``) says the way.
 
 How a hair departs from its neighbours is kept as two numbers a point: the parts of its direction along two axes that are
 carried along the way without turning about it. The same two numbers on another way make another hair of the same kind.
@@ -60,6 +60,15 @@ def flow(points_mm: np.ndarray, offsets: np.ndarray, sigma_mm: float, field: np.
 
 
 @njit(cache=True, nogil=True)
+def voxel_of(x, y, z, origin, voxel_mm, shape):
+    """Indices (i, j, k) of the voxel of a grid at (x, y, z) mm; beyond the grid, of the nearest."""
+    i = min(max(int((x - origin[0]) / voxel_mm), 0), shape[0] - 1)
+    j = min(max(int((y - origin[1]) / voxel_mm), 0), shape[1] - 1)
+    k = min(max(int((z - origin[2]) / voxel_mm), 0), shape[2] - 1)
+    return i, j, k
+
+
+@njit(cache=True, nogil=True)
 def way_at(flow, x, y, z, tx, ty, tz, own):
     """Unit direction of the hair at (x, y, z) mm that runs as (tx, ty, tz) does, and how near the nearest curve passes, squared.
 
@@ -92,11 +101,7 @@ def way_at(flow, x, y, z, tx, ty, tz, own):
                 sx += weight * flow.tangents[n, 0]
                 sy += weight * flow.tangents[n, 1]
                 sz += weight * flow.tangents[n, 2]
-    nx, ny, nz, _ = flow.field.shape
-    i = min(max(int((x - flow.origin[0]) / flow.voxel_mm), 0), nx - 1)
-    j = min(max(int((y - flow.origin[1]) / flow.voxel_mm), 0), ny - 1)
-    k = min(max(int((z - flow.origin[2]) / flow.voxel_mm), 0), nz - 1)
-    vector = flow.field[i, j, k]
+    vector = flow.field[voxel_of(x, y, z, flow.origin, flow.voxel_mm, flow.field.shape)]
     weight = FIELD_WEIGHT
     if vector[0] * tx + vector[1] * ty + vector[2] * tz < 0.0:
         weight = -weight

@@ -11,12 +11,11 @@ import numpy as np
 from numba import njit, prange
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from .hull import Grid
+from .grid import Grid
 
 CLEAR, SOFT = 0.5, 0.08  # share of the light from which on an angle sees a place, and how sharply
 SEEN_BY = np.array([0.0, 0.3, 0.6, 1.0, 1.5, 2.1, 3.0, 4.0, 5.2, 7.0, 9.5, 13.0])
 FOUND = np.array([0.03, 0.12, 0.38, 0.62, 0.76, 0.84, 0.9, 0.92, 0.94, 0.965, 0.985, 0.995])  # of hair that so many angles see; simulated locks
-ROUNDS = 4  # in which missing hair and what it hides are found from each other
 FULL = 0.75  # quantile of the density where hair was found: hair that is whole
 DARK, DARKEST = 0.1, 0.05  # share of the rays in the open: where fewer pass, hair is in the way; where far fewer, it is hair that nobody sees
 HALF_SEEN = (1.5, 5.0)  # captured places that so many angles should see tell by how many did what else is in the way
@@ -84,19 +83,27 @@ def hidden(
     empty = np.maximum(whole * body * dark(DARKEST) - gaussian_filter(density, _EMPTY_BLUR_MM / grid.voxel_mm), 0.0)
     behind = whole * body * dark(DARK) * (1.0 - found_share(seen(np.maximum(whole * body, density))))
     cells = (grid.to_cells(points_mm) - 0.5).T
+
+    def seen_by(share):
+        return map_coordinates(seen(density + np.float32(share) * behind), cells, order=1, mode="nearest")
+
+    missing = np.maximum(np.float32(_share(seen_by, evidence)) * behind, empty).astype(np.float32)
+    return Hidden(missing, found_share(seen(density + missing)))
+
+
+def _share(seen_by, evidence):
+    """The share of SHARES by which the captured points are seen by as many angles as they were; seen_by: by how many (N,), for a share."""
+    at = seen_by(0.0)
+    told = (at > HALF_SEEN[0]) & (at < HALF_SEEN[1]) & (evidence > 0)
+    if not told.any():
+        return 0.0
     ratios = []
     for share in SHARES:
-        at = map_coordinates(seen(density + np.float32(share) * behind), cells, order=1, mode="nearest")
-        if share == 0.0:
-            told = (at > HALF_SEEN[0]) & (at < HALF_SEEN[1]) & (evidence > 0)
-        if not told.any():
-            break
+        at = at if share == 0.0 else seen_by(share)
         ratios.append(float(at[told].sum() / evidence[told].sum()))
         if ratios[-1] <= EVIDENCE:
-            break
-    share = 1.0 if ratios and ratios[-1] > EVIDENCE else np.interp(-EVIDENCE, -np.array(ratios), SHARES[: len(ratios)]) if ratios else 0.0
-    missing = np.maximum(np.float32(share) * behind, empty).astype(np.float32)
-    return Hidden(missing, found_share(seen(density + missing)))
+            return np.interp(-EVIDENCE, -np.array(ratios), SHARES[: len(ratios)])
+    return 1.0
 
 
 _DARK_BLUR_MM, _EMPTY_BLUR_MM = 0.2, 0.3  # of what is dark; of the density beside which the body is empty

@@ -14,16 +14,15 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from .advection import AdvectionParams, captured_density, direction_field, uniform
 from .apart import ApartParams, Tubes, push_apart
 from .errors import StrandscopeError
-from .flow import Flow, across, departures, flow, way_at
+from .flow import Flow, across, departures, flow, voxel_of, way_at
 from .grid import Grid, occupied
 from .hidden import hidden
-from .links import LinkParams, bridge, find_links, ways_on
+from .joins import fibers_of
+from .links import LinkParams, bends, bridge, find_links, up_to, ways_on
 from .progress import Progress, silent
 
 
@@ -64,7 +63,7 @@ class Captured(NamedTuple):
     points_mm: np.ndarray  # (N, 3)
     offsets: np.ndarray  # (M + 1,)
     radius_mm: np.ndarray  # (N,)
-    error_mm: np.ndarray  # (N,) expected
+    error_mm: np.ndarray  # (N,) expected, NaN where it is not known
     evidence: np.ndarray  # (N,): cameras that saw the point
     stops: np.ndarray  # (M, 2) of Stop
 
@@ -94,16 +93,17 @@ def infill(
     unseen = hidden(density, body, through, diameter, grid, angles_deg, points, np.asarray(captured.evidence, float))
     progress("infill", 2, _STEPS)
     streams, course = _course(points, offsets, diameter, field_, unseen.found, occupancy, grid, params)
-    links, open_ends = find_links(points, offsets, captured.error_mm, captured.stops, params.links)
-    strands = [bridge(points, offsets, captured.error_mm, link, params.step_mm, params.links) for link in links]
+    wander = bends(points, offsets)
+    links, open_ends = find_links(points, offsets, captured.error_mm, captured.stops, params.links, wander)
+    strands = [bridge(points, offsets, captured.error_mm, link, params.step_mm, params.links, wander) for link in links]
     ends = [link.ends for link in links] + [(int(end), -1) for end in open_ends]
     progress("infill", 3, _STEPS)
-    ways = ways_on(points, offsets, captured.error_mm, open_ends, params.links)
+    ways = ways_on(points, offsets, captured.error_mm, open_ends, params.links, wander)
     continued = _continue(open_ends, ways, points, streams, course, params)
     progress("infill", 4, _STEPS)
     whole = _whole(unseen.missing, strands + continued, streams, course, grid, params)
     progress("infill", 5, _STEPS)
-    before = [_leading(points, offsets, end) for end in open_ends] + [np.empty((0, 3))] * len(whole)
+    before = [points[up_to(offsets, end, _PAD)] for end in open_ends] + [np.empty((0, 3))] * len(whole)
     strands += as_smooth_as(points, offsets, continued + whole, before, params.step_mm)
     filled = _gathered(strands, ends + [(-1, -1)] * (len(strands) - len(ends)), points, offsets, radii, params)
     progress("infill", _STEPS, _STEPS)
@@ -111,12 +111,6 @@ def infill(
 
 
 _STEPS = 6
-
-
-def _leading(points, offsets, end):
-    """The last points (n, 3) of a captured curve up to an end."""
-    first, last = offsets[end // 2], offsets[end // 2 + 1]
-    return points[max(first, last - _PAD) : last] if end % 2 else points[first : min(first + _PAD, last)][::-1]
 
 
 _PAD = 12  # points of a captured curve that tell how a strand is smoothed behind it
@@ -203,7 +197,6 @@ class _Course(NamedTuple):
     step_mm: float
     apart_mm: float  # distance from a captured curve from which on a strand does not meet it
     meeting_cost: float
-    typical_mm: float  # length of a whole fiber
     seed: int
 
 
@@ -231,7 +224,6 @@ def _course(points, offsets, diameter, field_, found, occupancy, grid, params) -
         params.step_mm,
         diameter,
         params.meeting_cost,
-        float(high[1] - low[1]),
         params.seed,
     )
 
@@ -266,6 +258,20 @@ def _donor(course, number, turn, a, b, back_a, back_b, first):
     return at, way, cos, sin
 
 
+def _longest(course):
+    """Points of a strand at most, so that one that goes round in circles ends."""
+    return int(np.ceil(4 * (2 * course.reach_mm + course.top_mm - course.bottom_mm) / course.step_mm))
+
+
+@njit(cache=True, nogil=True)
+def _departure(course, at, way, cos, sin):
+    """How the donor departs at a point of its, along its curve (way 1) or against it (-1), turned about the way."""
+    p, q = course.departures[at]
+    if way < 0:
+        p = -p  # the way turns round, and one axis across it with it
+    return cos * p - sin * q, sin * p + cos * q
+
+
 @njit(cache=True, nogil=True)
 def _inside(course, x, y, z):
     return x * x + z * z <= course.reach_mm**2 and course.bottom_mm <= y <= course.top_mm
@@ -273,11 +279,7 @@ def _inside(course, x, y, z):
 
 @njit(cache=True, nogil=True)
 def _cost_at(course, x, y, z):
-    nx, ny, nz = course.cost.shape
-    i = min(max(int((x - course.origin[0]) / course.voxel_mm), 0), nx - 1)
-    j = min(max(int((y - course.origin[1]) / course.voxel_mm), 0), ny - 1)
-    k = min(max(int((z - course.origin[2]) / course.voxel_mm), 0), nz - 1)
-    return course.cost[i, j, k]
+    return course.cost[voxel_of(x, y, z, course.origin, course.voxel_mm, course.cost.shape)]
 
 
 @njit(cache=True, nogil=True)
@@ -295,10 +297,8 @@ def _run(streams, course, number, own, x, y, z, tx, ty, tz, known, back, out):
     at, way, cos, sin = _donor(course, number, turns, a, b, back[0], back[1], not known)
     if at < 0:
         at, way, cos, sin = 0, 1, 0.0, 0.0  # no curve is long enough to tell: none departs
-    p, q = course.departures[at]
-    if way < 0:
-        p = -p
-    off_a, off_b = (a - (cos * p - sin * q), b - (sin * p + cos * q)) if known else (0.0, 0.0)
+    donor_a, donor_b = _departure(course, at, way, cos, sin)
+    off_a, off_b = (a - donor_a, b - donor_b) if known else (0.0, 0.0)
     fade = np.exp(-course.step_mm / _FADE_MM)
     cost = 0.0
     last_a, last_b = np.zeros(_LOOK_BACK + 1), np.zeros(_LOOK_BACK + 1)
@@ -312,20 +312,16 @@ def _run(streams, course, number, own, x, y, z, tx, ty, tz, known, back, out):
             found, way2, cos2, sin2 = _donor(course, number, turns, a, b, was[0], was[1], False)
             if found >= 0:
                 at, way, cos, sin = found, way2, cos2, sin2
-                p, q = course.departures[at]
-                if way < 0:
-                    p = -p
-                off_a, off_b = a - (cos * p - sin * q), b - (sin * p + cos * q)
+                donor_a, donor_b = _departure(course, at, way, cos, sin)
+                off_a, off_b = a - donor_a, b - donor_b
                 onward = at + way
             else:
                 onward = at
         at = onward
-        p, q = course.departures[at]
-        if way < 0:
-            p = -p
+        donor_a, donor_b = _departure(course, at, way, cos, sin)
         off_a *= fade
         off_b *= fade
-        next_a, next_b = cos * p - sin * q + off_a, sin * p + cos * q + off_b
+        next_a, next_b = donor_a + off_a, donor_b + off_b
         half_a, half_b = 0.5 * (a + next_a), 0.5 * (b + next_b)
         along = np.sqrt(max(1.0 - half_a * half_a - half_b * half_b, 0.04))
         dx, dy, dz = along * fx + half_a * ax + half_b * bx, along * fy + half_a * ay + half_b * by, along * fz + half_a * az + half_b * bz
@@ -353,8 +349,7 @@ def _run(streams, course, number, own, x, y, z, tx, ty, tz, known, back, out):
 def _continue(open_ends, ways, points, streams, course, params):
     """Strands (n, 3) on from each open end; n may be 0."""
     ends = np.asarray(open_ends, np.int64)
-    longest = int(np.ceil(4 * (2 * course.reach_mm + course.top_mm - course.bottom_mm) / course.step_mm))
-    out = np.zeros((len(ends), longest, 3), np.float32)
+    out = np.zeros((len(ends), _longest(course), 3), np.float32)
     sizes = np.zeros(len(ends), np.int64)
     _continue_all(streams, course, ends, ways, points, params.tries, out, sizes)
     return [out[n, : sizes[n]].astype(np.float64) for n in range(len(ends))]
@@ -408,7 +403,6 @@ _PARTS = 16  # in which whole fibers are added; each sees what those before have
 def _whole(missing, strands, streams, course, grid, params):
     """Strands (n, 3) for whole fibers that were not found, from bound to bound of the volume, where hair is still missing."""
     sigma, whole, by_count = params.density_mm / grid.voxel_mm, [], params.count is not None
-    longest = int(np.ceil(4 * (2 * course.reach_mm + course.top_mm - course.bottom_mm) / course.step_mm))
     left = missing - gaussian_filter(_density_of(strands, grid), sigma, mode="constant")
     for part in range(_PARTS):
         wanted = ((params.count - len(whole)) if by_count else float(left.sum()) * grid.voxel_mm**3) / (_PARTS - part)
@@ -416,7 +410,7 @@ def _whole(missing, strands, streams, course, grid, params):
             break
         cells = np.flatnonzero(left.ravel() > 0) if np.any(left > 0) else np.arange(left.size)
         weights = np.cumsum(np.maximum(left.ravel()[cells], 1e-6), dtype=np.float64)
-        more = _some_whole(wanted, by_count, len(whole), cells, weights, longest, streams, course, grid, params)
+        more = _some_whole(wanted, by_count, len(whole), cells, weights, streams, course, grid, params)
         whole += more
         left = left - gaussian_filter(_density_of(more, grid), sigma, mode="constant")
     return whole
@@ -429,14 +423,14 @@ def _density_of(strands, grid):
     return captured_density(np.concatenate(strands), np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64), grid)
 
 
-def _some_whole(wanted, by_count, before, cells, weights, longest, streams, course, grid, params):
+def _some_whole(wanted, by_count, before, cells, weights, streams, course, grid, params):
     """Whole fibers until ``wanted`` of them, or of mm, are there."""
     whole, done = [], 0.0
     guess = int(np.ceil(wanted)) if by_count else int(np.ceil(wanted / max(course.top_mm - course.bottom_mm, 1e-6)))
     for turn in range(8):
         size = max(guess - len(whole), 1)
         first = _WHOLE + (before + len(whole)) * params.whole_tries + turn * 1_000_003
-        out, sizes = np.zeros((size, 2 * longest, 3)), np.zeros(size, np.int64)
+        out, sizes = np.zeros((size, 2 * _longest(course), 3)), np.zeros(size, np.int64)
         _try_whole(streams, course, first, cells, weights, np.asarray(grid.shape), params.whole_tries, out, sizes)
         for strand, length in zip(out, sizes, strict=True):
             if length * course.step_mm < params.least_new_mm:
@@ -481,7 +475,7 @@ def _try_whole(streams, course, first, cells, weights, shape, tries, out, sizes)
             way /= np.sqrt(np.sum(way * way))
             behind, more = _go_on(streams, course, number + 500_000_003, -1, before, way, room[half:])
             size = ahead + behind + 1
-            cost = (cost + more) / (size * course.step_mm) * course.typical_mm
+            cost = (cost + more) / (size * course.step_mm) * (course.top_mm - course.bottom_mm)
             cost += np.log(-np.log(uniform(course.seed, number, 0) + 1e-12) + 1e-12)
             if cost < best and size > 1:
                 best = cost
@@ -495,11 +489,7 @@ def _try_whole(streams, course, first, cells, weights, shape, tries, out, sizes)
 
 @njit(cache=True, nogil=True)
 def _field_at(streams, x, y, z):
-    nx, ny, nz, _ = streams.field.shape
-    i = min(max(int((x - streams.origin[0]) / streams.voxel_mm), 0), nx - 1)
-    j = min(max(int((y - streams.origin[1]) / streams.voxel_mm), 0), ny - 1)
-    k = min(max(int((z - streams.origin[2]) / streams.voxel_mm), 0), nz - 1)
-    vector = streams.field[i, j, k]
+    vector = streams.field[voxel_of(x, y, z, streams.origin, streams.voxel_mm, streams.field.shape)]
     length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
     if length < 1e-6:
         return 0.0, -1.0, 0.0
@@ -521,7 +511,7 @@ def _gathered(strands, from_ends, points, offsets, radii, params) -> Infill:
     together = np.concatenate(strands) if strands else np.empty((0, 3))
     joined = [(end, 2 * (count + k) + side) for k, ends in enumerate(from_ends) for side, end in enumerate(ends) if end >= 0]
     joins = np.array(joined + meeting, np.int64).reshape(-1, 2)
-    fiber = _fibers(joins, count + len(strands))
+    fiber = fibers_of(joins, count + len(strands))
     together = _pushed(together, starts, radius, fiber, from_ends, points, offsets, radii, params)
     return Infill(together.astype(np.float32), starts, np.repeat(radius, sizes).astype(np.float32), joins)
 
@@ -530,23 +520,16 @@ def _pushed(together, starts, radius, fiber, from_ends, points, offsets, radii, 
     """The points of the strands after pushing apart; the ends that they go on from are held."""
     count = len(radii)
     held = np.array([[end >= 0 for end in ends] for ends in from_ends], bool).reshape(-1, 2)
-    tips = points[[[offsets[end // 2 + 1] - 1 if end % 2 else offsets[end // 2] for end in ends] for ends in from_ends]] if len(held) else None
+    tips = [[points[up_to(offsets, end, 1)] if end >= 0 else np.empty((0, 3)) for end in ends] for ends in from_ends]
     pieces = []
-    for k, (first, last) in enumerate(held):
-        pieces += [tips[k, :1][: int(first)], together[starts[k] : starts[k + 1]], tips[k, 1:][: int(last)]]
+    for k, (first, last) in enumerate(tips):
+        pieces += [first, together[starts[k] : starts[k + 1]], last]
     sizes = np.diff(starts) + held.sum(axis=1)
     moving = Tubes(np.concatenate(pieces or [together]), np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64), radius, fiber[count:])
     after = push_apart(moving, Tubes(points, offsets, radii, fiber[:count]), held, params.apart)
     ours = np.ones(len(after), bool)
     ours[moving.offsets[:-1][held[:, 0]]] = ours[moving.offsets[1:][held[:, 1]] - 1] = False
     return after[ours]
-
-
-def _fibers(joins, count):
-    """The number of the fiber (count,) of each curve: of those that are joined, one."""
-    pieces = joins // 2
-    graph = coo_array((np.ones(len(pieces)), pieces.T), shape=(count, count))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 def _radius(ends, radii, seed, number):

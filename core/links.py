@@ -51,6 +51,7 @@ _KEPT_MM = (0.5, 20.0)
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 _BACK = np.array([1.0, -1.0, 1.0])  # a state seen the other way: the direction turns round
 _SLOPE = 0.2  # of hair that has nothing to do with an end, either way across it
+_UNKNOWN_ERROR_MM = 0.02  # of a point whose error is not known: two thirds of a pixel
 _USED = 25  # points of a curve that tell the state of its end
 _LEANING_MM = 0.03  # added to the errors of points where only the way of an end is wanted
 _TOLD_BY = 4  # points by which the way of a curve's end is told
@@ -101,26 +102,32 @@ def _autocovariance(points, offsets, step, lags):
 
 
 def find_links(
-    points_mm: np.ndarray, offsets: np.ndarray, error_mm: np.ndarray, stops: np.ndarray, params: LinkParams | None = None
+    points_mm: np.ndarray,
+    offsets: np.ndarray,
+    error_mm: np.ndarray,
+    stops: np.ndarray,
+    params: LinkParams | None = None,
+    wander: Bends | None = None,
 ) -> tuple[list[Link], np.ndarray]:
     """The links between open ends, each end in one at most, the surest first; and the open ends that are left (k,).
 
-    points_mm (N, 3), offsets (M + 1,): captured curves; error_mm (N,): what is expected of each point; stops (M, 2): of ``Stop``. An
-    end is open unless its curve left the volume there.
+    points_mm (N, 3), offsets (M + 1,): captured curves; error_mm (N,): what is expected of each point, NaN where it is not known;
+    stops (M, 2): of ``Stop``; wander: of ``bends`` of the curves, if it is known. An end is open unless its curve left the volume there.
     """
     params = params or LinkParams()
     points, offsets = np.asarray(points_mm, np.float64), np.asarray(offsets, np.int64)
-    wander = bends(points, offsets)
+    wander = wander or bends(points, offsets)
     open_ends = np.flatnonzero(np.asarray(stops).ravel() != Stop.LEFT_VOLUME)
     if len(open_ends) < 2:
         return [], open_ends
-    states = [_state(*_sure(*_leading(points, error_mm, offsets, end), params), wander, params) for end in open_ends]
+    pieces = [_leading(points, error_mm, offsets, end) for end in open_ends]
+    states = [_state(*_sure(*piece, params), wander, params) for piece in pieces]
     mean, spread = np.stack([s[0] for s in states]), np.stack([s[1] for s in states])
     one, other = _candidates(mean, open_ends, params)
     crowd = _crowd(mean[:, 0])
     both = [_scores(mean, spread, *way, wander, crowd, params) for way in ((one, other), (other, one))]
     score, length = (0.5 * (a + b) for a, b in zip(*both, strict=True))
-    tips = np.stack([_leading(points, error_mm, offsets, end)[0][-1] for end in open_ends])
+    tips = np.stack([piece[-1] for piece, _ in pieces])
     length -= np.sum((tips[one] - mean[one, 0]) * mean[one, 1], axis=1) + np.sum((tips[other] - mean[other, 0]) * mean[other, 1], axis=1)
     links, used = [], np.zeros(len(open_ends), bool)
     for k in np.lexsort((other, one, -score)):
@@ -132,28 +139,35 @@ def find_links(
     return links, open_ends[~used]
 
 
-def ways_on(points_mm: np.ndarray, offsets: np.ndarray, error_mm: np.ndarray, ends: np.ndarray, params: LinkParams | None = None) -> np.ndarray:
+def ways_on(
+    points_mm: np.ndarray, offsets: np.ndarray, error_mm: np.ndarray, ends: np.ndarray, params: LinkParams | None = None, wander: Bends | None = None
+) -> np.ndarray:
     """Unit directions (k, 3) in which hair goes on beyond open ends (k,), told by all of the curve that its bends let tell: the last
-    points lean towards neighbours."""
+    points lean towards neighbours. wander: of ``bends`` of the curves, if it is known."""
     params = params or LinkParams()
     points, offsets = np.asarray(points_mm, np.float64), np.asarray(offsets, np.int64)
-    wander = bends(points, offsets)
+    wander = wander or bends(points, offsets)
     pieces = [_leading(points, error_mm, offsets, end) for end in ends]
     ways = np.array([_state(piece, error + _LEANING_MM, wander, params)[0][1] for piece, error in pieces]).reshape(-1, 3)
     return ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
 
 
+def up_to(offsets: np.ndarray, end: int, most: int) -> np.ndarray:
+    """The points (n,) of the curve of an end, from far away up to it, ``most`` of them at most."""
+    first, last = offsets[end // 2], offsets[end // 2 + 1]
+    return np.arange(max(first, last - most), last) if end % 2 else np.arange(first, min(first + most, last))[::-1]
+
+
 def _leading(points, error_mm, offsets, end):
     """The points (n, 3) and errors (n,) of the curve of an end, from far away up to it, no more than tell its state."""
-    first, last = offsets[end // 2], offsets[end // 2 + 1]
-    which = np.arange(max(first, last - _USED), last) if end % 2 else np.arange(first, min(first + _USED, last))[::-1]
-    return points[which], np.nan_to_num(np.asarray(error_mm, np.float64)[which], nan=0.02)
+    which = up_to(offsets, end, _USED)
+    return points[which], np.nan_to_num(np.asarray(error_mm, np.float64)[which], nan=_UNKNOWN_ERROR_MM)
 
 
 def _sure(points, error, params):
     """Points (n, 3) and errors (n,) of a curve up to where it begins to be unsure of its end; of a short one, the first half."""
     left = np.r_[np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)[::-1])[::-1], 0.0]
-    size = max(int(np.sum(left >= params.unsure_mm)), min((len(points) + 1) // 2, len(points)), min(3, len(points)))
+    size = max(int(np.sum(left >= params.unsure_mm)), (len(points) + 1) // 2, min(3, len(points)))
     return points[:size], error[:size]
 
 
@@ -249,11 +263,17 @@ def _axes(tangents):
 
 
 def bridge(
-    points_mm: np.ndarray, offsets: np.ndarray, error_mm: np.ndarray, link: Link, step_mm: float, params: LinkParams | None = None
+    points_mm: np.ndarray,
+    offsets: np.ndarray,
+    error_mm: np.ndarray,
+    link: Link,
+    step_mm: float,
+    params: LinkParams | None = None,
+    wander: Bends | None = None,
 ) -> np.ndarray:
     """The points (n, 3) mm between the two ends of a link, about step_mm apart, without the ends themselves; n may be 0.
 
-    A quintic that has place, direction and curvature of both ends.
+    A quintic that has place, direction and curvature of both ends. wander: of ``bends`` of the curves, if it is known.
     """
     params = params or LinkParams()
     points, offsets = np.asarray(points_mm, np.float64), np.asarray(offsets, np.int64)
@@ -262,7 +282,7 @@ def bridge(
     ways = [piece[-1] - piece[max(len(piece) - 1 - _TOLD_BY, 0)] for piece in (here, there)]
     if link.length_mm <= step_mm or np.sum(gap * ways[0]) <= 0 or np.sum(gap * ways[1]) >= 0:
         return np.empty((0, 3))
-    wander = bends(points, offsets)
+    wander = wander or bends(points, offsets)
     states = [_state(piece, np.zeros(len(piece)), wander, params)[0] for piece in (here, there)]
     states[0][0], states[1][0] = here[-1], there[-1]
     length = max(float(np.linalg.norm(gap)), link.length_mm)

@@ -8,7 +8,6 @@ import json
 import multiprocessing
 import os
 import threading
-import tomllib
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager, nullcontext
@@ -24,10 +23,11 @@ from .confidence import confidence, expected_error
 from .crew import Threads
 from .errors import CaptureError, StrandscopeError
 from .features import RECORDS, Index, SweepFeatures, build_index, load_features, pack, save_features, seen_by, unpack, upright
-from .files import atomic
+from .files import atomic, toml_tables
 from .geometry import Optics
+from .grid import Grid
 from .grow import Grown, GrowParams, grow
-from .hull import Grid, HullParams, blueness, carve, free_share, grid_of, occupancy, visual_hull
+from .hull import HullParams, blueness, carve, free_share, grid_of, occupancy, visual_hull
 from .infill import Captured, InfillParams, infill
 from .inside import InsideParams, surface_distance
 from .journal import Journal, Unwritten
@@ -59,7 +59,6 @@ from .volume import Volume, load_volume, save_volume, surface
 
 VERSION = "0.1.0"
 WORKING_ROOM = 600_000_000  # bytes: the program itself, seed cells, a batch of curves
-UNKNOWN_ERROR_MM = 0.02
 SAMPLED_PHOTOGRAPHS = 24  # that ``estimate`` looks at
 STAMP, JOURNAL, USED_UP, VOLUME = "made-from.txt", "growing.journal", "growing.used", "volume.npz"  # in the folder beside the output
 # Table 1: c in 12-bit numbers with the black level (128) in it, omega in degrees, gamma in px, boxes in px
@@ -560,9 +559,9 @@ def inside(strands: Strands, bounds: np.ndarray, grid: Grid, angles_deg, params:
 
 
 def _told(strands: Strands) -> Captured:
-    """What the infill is told of captured strands; the error of a point that is not known is taken as that of a pixel."""
+    """What the infill is told of captured strands."""
     count = len(strands.points_mm)
-    error = np.full(count, UNKNOWN_ERROR_MM) if strands.error_mm is None else np.nan_to_num(strands.error_mm, nan=UNKNOWN_ERROR_MM)
+    error = np.full(count, np.nan) if strands.error_mm is None else strands.error_mm
     evidence = np.zeros(count) if strands.evidence is None else strands.evidence
     stops = np.zeros((len(strands), 2), np.uint8) if strands.stops is None else strands.stops
     return Captured(strands.points_mm, strands.offsets, strands.radius_mm, error, evidence, stops)
@@ -700,12 +699,7 @@ def write_toml(path: Path, parameters: Parameters) -> None:
 
 def read_toml(path: Path) -> Parameters:
     """Read parameters from TOML; what is not there has its default. Raises StrandscopeError naming file and field."""
-    try:
-        tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise StrandscopeError(f"{path}: not found; expected a TOML file with parameters") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise StrandscopeError(f"{path}: not valid TOML: {error}") from error
+    tables = toml_tables(path, "parameters")
     without = tables.get("infill") is False
     start = Parameters(paper=PaperParams()) if "paper" in tables else Parameters()
     parameters = _filled(start, {k: v for k, v in tables.items() if not (without and k == "infill")}, path, "")

@@ -8,6 +8,7 @@ import numpy as np
 
 from .errors import StrandsError
 from .files import atomic
+from .joins import fibers_of
 from .stops import Stop
 
 CAPTURED, INFILL = 0, 1  # the values of ``kind``
@@ -67,18 +68,7 @@ def _kept(joins: np.ndarray, keep: np.ndarray) -> np.ndarray:
 
 def fibers(strands: Strands) -> np.ndarray:
     """For each curve (M,) int64 the number of the fiber that it is a piece of, as ``joins`` tell; without any, a fiber is a curve."""
-    fiber = np.arange(len(strands))
-
-    def root(curve):
-        while fiber[curve] != curve:
-            fiber[curve] = fiber[fiber[curve]]
-            curve = fiber[curve]
-        return curve
-
-    for one, other in () if strands.joins is None else strands.joins // 2:
-        a, b = sorted((root(one), root(other)))
-        fiber[b] = a
-    return np.unique([root(curve) for curve in range(len(strands))], return_inverse=True)[1]
+    return fibers_of(np.empty((0, 2), np.int64) if strands.joins is None else strands.joins, len(strands))
 
 
 def clip(strands: Strands, depth_mm: np.ndarray) -> tuple[Strands, np.ndarray]:

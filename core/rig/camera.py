@@ -4,7 +4,6 @@ A photograph is handed over as a file of its own under a temporary name. What is
 after the session has said that its copy is safe.
 """
 
-import hashlib
 import math
 import os
 import re
@@ -20,7 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..errors import CaptureError, StrandscopeError
-from ..files import explain
+from ..files import explain, sha256
 from ..raw import LINEAR_SUFFIXES, RAW_SUFFIXES, read_header
 from .plan import Exposure, Plan
 
@@ -552,7 +551,7 @@ class CableCamera:
         self._known.update(complete)
         own = []
         for path in complete:
-            digest = _digest(path)
+            digest = sha256(path)
             if digest in self._hashes:
                 self._ignore([path], "has the bytes of an earlier photograph")
             else:
@@ -620,11 +619,6 @@ def _size(path: Path) -> int:
         return path.stat().st_size
     except OSError:
         return 0
-
-
-def _digest(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _write(path: Path, data) -> None:

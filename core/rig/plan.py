@@ -5,14 +5,13 @@ the hair once in front of a small aperture: the turntable sequence, used for val
 """
 
 import math
-import tomllib
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import NamedTuple
 
 from ..errors import StrandscopeError
-from ..files import atomic
+from ..files import atomic, toml_tables
 
 SWEEP, TURNTABLE, CHECK = "sweep", "turntable", "check"
 MOST_EXPOSURES = 1_000_000
@@ -219,11 +218,7 @@ def load_plan(path: Path) -> Plan:
 def read_table(path: Path, name: str) -> dict:
     """One table of a TOML file, empty if it is not there. Raises StrandscopeError for a file that is not there or not TOML."""
     try:
-        tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise StrandscopeError(f"{path}: not found; expected a TOML file with a table [{name}]") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise StrandscopeError(f"{path}: not valid TOML: {error}") from error
+        tables = toml_tables(path, f"a table [{name}]")
     except OSError as error:
         raise StrandscopeError(f"{path}: cannot be read ({error.strerror})") from error
     for key, value in tables.items():

@@ -28,7 +28,7 @@ import numpy as np
 
 from ..capture import FILE_NAME, Capture, Sweep, Turntable, save_capture
 from ..errors import CaptureError, StrandscopeError
-from ..files import explain, only_one, sync_folder
+from ..files import explain, only_one, sha256, sync_folder
 from ..geometry import Optics
 from ..progress import Progress, silent
 from ..raw import Header, read_header, read_planes
@@ -124,7 +124,7 @@ def verify(folder: Path, story: Story, last: int | None = None) -> Iterator[tupl
             yield key, f"{path}: the photograph is missing"
         elif path.stat().st_size != record["bytes"]:
             yield key, f"{path}: has {path.stat().st_size} bytes, the logbook says {record['bytes']}"
-        elif (last is None or i >= len(records) - last) and _sha256(path) != record["sha256"]:
+        elif (last is None or i >= len(records) - last) and sha256(path) != record["sha256"]:
             yield key, f"{path}: its bytes are not those that the logbook says"
 
 
@@ -588,11 +588,6 @@ def _place(place: Place | None) -> dict:
 
 def _words(key: Key) -> str:
     return f"{key[0]} {key[1]}, frame {key[2]}"
-
-
-def _sha256(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _free(folder: Path) -> int:
